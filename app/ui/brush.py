@@ -19,7 +19,7 @@ from app.ui.nodes import add_points, clear, place
 from app.ui.sensor import SCAN_POINT_SCALE
 from app.ui.study_maths import nearest_to_ray
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, by_user
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user
 
 _OFF: Final = "off"
 _MARKS: Final = {"ground": GROUND, "not ground": NON_GROUND, "erase": UNMARKED}
@@ -47,20 +47,16 @@ class BrushPanel:
             "brush", (*_MARKS, _OFF), hint="Pause, then click points of the scan; Shift and drag marks a rectangle."
         )
         self._radius = gui.add_slider("radius (m)", 0.05, 3.0, 0.05, 0.4)
-        self._rest = gui.add_button(
-            "Mark the rest as labelled",
-            color="gray",
-            hint="Points of this frame without a mark take the label that the engine gave them; then correct these.",
+        hint = "Points of this frame without a mark take the label that the engine gave them; then correct these."
+        self._rest = add_button(gui, "Mark the rest as labelled", lambda _: self._mark_rest(), hint=hint)
+        self._undo = add_button(
+            gui, "Undo mark", lambda _: page.send(UndoPaint()), viser.Icon.ARROW_BACK_UP, visible=False
         )
-        self._undo = gui.add_button("Undo mark", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False)
         self._bridge = Bridge(gui, "labelled", self._go)
         self._list = gui.add_html("", visible=False)
-        self._save = gui.add_button("Download labels", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+        self._save = add_button(gui, "Download labels", self._download, viser.Icon.DOWNLOAD, visible=False)
         self._load = gui.add_upload_button("Load labels", icon=viser.Icon.UPLOAD, color="gray", mime_type=".json")
         brush.on_click(by_user(lambda name, _: self.choose(name)))
-        self._rest.on_click(by_user(lambda _, __: self._mark_rest()))
-        self._undo.on_click(by_user(lambda _, __: page.send(UndoPaint())))
-        self._save.on_click(by_user(lambda _, client: self._download(client)))
         self._load.on_upload(by_user(self._read))
         page.scene.on_click()(self._click)
         page.scene.on_rect_select(modifier="shift")(self._drag)

@@ -16,7 +16,7 @@ from app.slam.doubts import IN_DOUBT
 from app.slam.params import Params
 from app.ui.background import Background
 from app.ui.html import panel
-from app.ui.widgets import Page
+from app.ui.widgets import Page, add_button
 
 _EXPLAINED = (
     "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and what each scan line gets "
@@ -49,13 +49,11 @@ class CalibrationPanel:
     def __init__(self, page: Page, *, unasked: bool = False) -> None:
         self._page, self._unasked = page, unasked
         gui = page.gui
-        self._button = gui.add_button("Calibrate", hint=_EXPLAINED, disabled=True)
+        self._button = add_button(gui, "Calibrate", lambda _: self._begin(), color=None, hint=_EXPLAINED, disabled=True)
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._html = gui.add_html("", visible=False)
-        self._apply = gui.add_button("Apply", visible=False)
+        self._apply = add_button(gui, "Apply", lambda _: self._use(), color=None, visible=False)
         self._plot = gui.add_html("", visible=False)
-        self._button.on_click(lambda _: self._begin())
-        self._apply.on_click(lambda _: self._use())
         self._work = Background("calibrate", "Calibration")
         self._values: dict[str, Any] = {}
         self._sentence = ""  # for the report, once the values are applied

@@ -12,7 +12,7 @@ import viser
 from app.server.keeping import KeepView
 from app.server.protocol import Snapshot
 from app.slam.types import F64
-from app.ui.widgets import Changes, Page, by_user, show
+from app.ui.widgets import Changes, Page, add_button, by_user, show
 
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
@@ -235,8 +235,7 @@ class CameraPanel:
             "orthographic", False, hint="Parallel lines stay parallel, and lengths can be compared."
         )
         self._parallel.on_update(by_user(lambda _, client: self._go(client, self._stand(client))))
-        keep = gui.add_button("Keep this view", icon=viser.Icon.BOOKMARK, color="gray")
-        keep.on_click(by_user(lambda _, client: self._keep(client)))
+        add_button(gui, "Keep this view", self._keep, viser.Icon.BOOKMARK)
         self._list = gui.add_button_group(
             "kept views", ("1",), visible=False, hint="Go back to a view that was kept in this session."
         )

@@ -21,12 +21,11 @@ from app.ui.geometry import wxyz
 from app.ui.html import panel
 from app.ui.measure import MeasurePanel
 from app.ui.nodes import add_lines
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, notify_error, poses_of, show
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, notify_error, poses_of, show
 
 _NODE: Final = f"{ROOT}/clip"
 _COLOUR: Final = (255, 205, 80)
 _HANDLE_PX: Final = 70.0
-_CUT: Final = "Cut by two clicks"
 _MIDDLE: Final = -1
 """Number of the handle in the middle; the others are those of `FACES`."""
 
@@ -63,32 +62,27 @@ class ClipPanel:
             self._size = gui.add_vector3("size (m)", (1.0, 1.0, 1.0), min=(0.05, 0.05, 0.05), step=0.05)
             self._turn = gui.add_number("turn (°)", 0.0, min=-360.0, max=360.0, step=1.0)
             self._pull = gui.add_checkbox("handles", True, hint="Arrows move the sides, the one in the middle the box.")
-            front = gui.add_button("Look from its front", icon=viser.Icon.VIEWPORT_NARROW, color="gray")
-            save = gui.add_button("Save as a section…", icon=viser.Icon.DEVICE_FLOPPY, color="gray")
-            whole = gui.add_button("Around the whole map", icon=viser.Icon.MAXIMIZE, color="gray")
+            add_button(gui, "Look from its front", self.look, viser.Icon.VIEWPORT_NARROW)
+            save = viser.Icon.DEVICE_FLOPPY
+            add_button(gui, "Save as a section…", lambda client: ask_where(client, "section"), save)
+            add_button(gui, "Around the whole map", lambda _: self._send(box=self._whole()), viser.Icon.MAXIMIZE)
         self._slab = gui.add_number(
             "slab (m)", 1.0, min=0.05, max=100.0, step=0.05, hint="How thick a cut section or the profile is."
         )
-        self._cut = gui.add_button(
-            _CUT, icon=viser.Icon.SLICE, color="gray", hint="Click two points: the clip box becomes the slab between."
-        )
+        hint = "Click two points: the clip box becomes the slab between."
+        add_button(gui, "Cut by two clicks", self._begin_cut, viser.Icon.SLICE, hint=hint)
         self._asked = gui.add_html("", visible=False)
         self._unrolled = gui.add_checkbox(
             "profile", False, hint="The map along the walked path: to the right the way walked, up the height."
         )
-        self._save_profile = gui.add_button(
-            "Save the profile…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", visible=False
+        self._save_profile = add_button(
+            gui, "Save the profile…", lambda client: ask_where(client, "profile"), save, visible=False
         )
         for control in (self._middle, self._size, self._turn):
             control.on_update(by_user(lambda _, __: self._typed()))
         self._on.on_update(by_user(lambda on, _: self._switch(on)))
         self._slab.on_update(by_user(lambda slab, _: self._send(slab=slab)))
         self._unrolled.on_update(by_user(self._unroll))
-        whole.on_click(by_user(lambda _, client: self._send(box=self._whole())))
-        front.on_click(by_user(lambda _, client: self.look(client)))
-        save.on_click(by_user(lambda _, client: ask_where(client, "section")))
-        self._save_profile.on_click(by_user(lambda _, client: ask_where(client, "profile")))
-        self._cut.on_click(by_user(lambda _, client: self._begin_cut(client)))
 
     def seen(self, current: Snapshot, view: View) -> View:
         """The view with the map clipped, or with a profile in its place."""

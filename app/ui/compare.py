@@ -3,6 +3,7 @@
 `Sides` decides which of the two the parameters belong to; `ComparePanel` shows both.
 """
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -27,6 +28,7 @@ from app.ui.widgets import (
     Changes,
     Page,
     View,
+    add_button,
     by_user,
     chart,
     dialog,
@@ -129,14 +131,10 @@ class ComparePanel:
 
         self._status = gui.add_html(maths.status(None, None, ("", ""), -1))
         self._name = gui.add_text("name", "", hint="Of the fork, and of its file when you keep it.")
-        self._fork = gui.add_button(
-            "Fork here",
-            icon=viser.Icon.GIT_BRANCH,
-            hint="Continue from this frame with other parameters, side by side.",
-        )
-        self._open = gui.add_button(
-            "Open as B…", icon=viser.Icon.FOLDER_OPEN, color="gray", hint="A kept fork or an older session, beside A."
-        )
+        hint = "Continue from this frame with other parameters, side by side."
+        self._fork = add_button(gui, "Fork here", lambda _: self._begin(), viser.Icon.GIT_BRANCH, color=None, hint=hint)
+        hint = "A kept fork or an older session, beside A."
+        self._open = add_button(gui, "Open as B…", self._choose, viser.Icon.FOLDER_OPEN, hint=hint)
         self._what = gui.add_button_group(
             "fork", (_SWAP, _KEEP, _DISCARD), visible=False, hint="X swaps. Keep: as a file that can be opened again."
         )
@@ -159,8 +157,6 @@ class ComparePanel:
             plot = chart(gui, (np.zeros(1),) * (1 + len(lines)), lines)
             plot.visible = False
             self._plots.append((named, plot))
-        self._fork.on_click(by_user(lambda _, client: self._act("", client)))
-        self._open.on_click(by_user(lambda _, client: self._choose(client)))
         self._what.on_click(by_user(self._act))
         gui.add_command("Swap A and its fork B", hotkey="X").on_trigger(lambda _: self._swap_if_any())
 
@@ -237,23 +233,22 @@ class ComparePanel:
                 client.add_notification("Kept", f"The fork is saved as {path}; hemislam serve opens it.")
             case "discard":
                 self._forks.discard()
-            case _:
-                self._forks.fork(self._name.value)
-                self._sides.choose("B")
+
+    def _begin(self) -> None:
+        self._forks.fork(self._name.value)
+        self._sides.choose("B")
 
     def _choose(self, client: viser.ClientHandle) -> None:
         kept = self._forks.kept()
         with dialog(client, "Open a session as B") as close:
             if not kept:
                 client.gui.add_html(panel("text", "This recording has no other session yet; fork, then keep the fork."))
-            buttons = [(path, client.gui.add_button(path.stem, color="gray")) for path in kept]
+            for path in kept:
+                add_button(client.gui, path.stem, partial(self._open_beside, path, close))
 
-        def chosen(path: Path, _: object, __: viser.ClientHandle) -> None:
-            close()
-            self._forks.open(path)
-
-        for path, button in buttons:
-            button.on_click(by_user(partial(chosen, path)))
+    def _open_beside(self, path: Path, close: Callable[[], None], _: viser.ClientHandle) -> None:
+        close()
+        self._forks.open(path)
 
     def _swap_if_any(self) -> None:
         if self._forks.other is not None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import viser
 
@@ -19,7 +19,7 @@ from app.slam.trajectory import truth_beside
 from app.ui.html import panel
 from app.ui.nodes import clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import Changes, Page, by_user, dialog
+from app.ui.widgets import Changes, Page, add_button, by_user, dialog
 
 _MOST_ENTRIES: Final = 60
 _RECENT: Final = 3
@@ -62,21 +62,21 @@ class RecentPanel:
         kept: folder of the session files. browse: asks for a recording.
     """
 
-    def __init__(
-        self, page: Page, folders: Folders, kept: Path, browse: Callable[[Any, viser.ClientHandle], None]
-    ) -> None:
+    def __init__(self, page: Page, folders: Folders, kept: Path, browse: Callable[[viser.ClientHandle], None]) -> None:
         self._send, self._folders, self._kept = page.send, folders, kept
         self._sessions: list[tuple[Path, SavedSession]] = []
         self._changes = Changes()
         self._bridge = Bridge(page.gui, "last", self._open_last)
         self._last = page.gui.add_html("")  # it stays as long as the recording is open, so that nothing below moves
-        self._browse = page.gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, visible=False)
-        self._browse.on_click(by_user(browse))
+        self._browse = add_button(
+            page.gui, "Open a recording…", browse, viser.Icon.FOLDER_OPEN, color=None, visible=False
+        )
         icons = (viser.Icon.HISTORY, *[viser.Icon.FILE_DATABASE] * _RECENT)
-        self._buttons = [page.gui.add_button("", icon=icon, color="gray", visible=False) for icon in icons]
+        self._buttons = [
+            add_button(page.gui, "", partial(self._pick, number), icon, visible=False)
+            for number, icon in enumerate(icons)
+        ]
         self._offers: list[tuple[str, Path]] = []
-        for number, button in enumerate(self._buttons):
-            button.on_click(by_user(partial(self._pick, number)))
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording
@@ -108,7 +108,7 @@ class RecentPanel:
         if self._sessions:
             self._open(self._sessions[0][0])
 
-    def _pick(self, number: int, _value: Any, _client: viser.ClientHandle) -> None:
+    def _pick(self, number: int, _: viser.ClientHandle) -> None:
         if number < len(self._offers):
             self._open(self._offers[number][1])
 
@@ -138,22 +138,19 @@ class FilesPanel:
     def add_buttons(self) -> None:
         """Add the buttons to the present container."""
         gui = self._page.gui
-        self._open = gui.add_button("Open a recording…", icon=viser.Icon.FOLDER_OPEN, color="gray")
-        self._compare = gui.add_button(
+        add_button(gui, "Open a recording…", self.browse, viser.Icon.FOLDER_OPEN)
+        self._compare = add_button(
+            gui,
             "Compare with a trajectory…",
-            icon=viser.Icon.ROUTE,
-            color="gray",
+            self._browse_trajectories,
+            viser.Icon.ROUTE,
             disabled=True,
             hint="Draw the truth, or what another run or program made of this recording, beside the trajectory, and "
             "plot the distance to it.",
         )
-        self._save = gui.add_button("Save results…", icon=viser.Icon.DEVICE_FLOPPY, color="gray", disabled=True)
+        self._save = add_button(gui, "Save results…", self.ask_where, viser.Icon.DEVICE_FLOPPY, disabled=True)
         self._saved = gui.add_html("", visible=False)
-        self._download = gui.add_button("Download…", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
-        self._download.on_click(by_user(lambda _, client: self._offer(client)))
-        self._open.on_click(by_user(self.browse))
-        self._compare.on_click(by_user(self._browse_trajectories))
-        self._save.on_click(by_user(lambda _, client: self.ask_where(client)))
+        self._download = add_button(gui, "Download…", self._offer, viser.Icon.DOWNLOAD, visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
         self._save.disabled = snapshot.result is None
@@ -163,7 +160,7 @@ class FilesPanel:
         if done:
             self._saved.content = panel("path", "Saved in ", str(done[-1]))
 
-    def browse(self, _: Any, client: viser.ClientHandle) -> None:
+    def browse(self, client: viser.ClientHandle) -> None:
         def choose(path: Path) -> None:
             path = self._folders.openable(path)
             self._page.send(OpenRecording(path, truth_beside(path) if with_truth.value else None))
@@ -175,7 +172,7 @@ class FilesPanel:
                 "with truth", True, hint="Also load the trajectory (.tum) beside the recording, if there is one."
             )
 
-    def _browse_trajectories(self, _: Any, client: viser.ClientHandle) -> None:
+    def _browse_trajectories(self, client: viser.ClientHandle) -> None:
         folders = Folders([*self._folders.roots, *([self._results] if self._results.is_dir() else [])])
         recording, gui = self._page.snapshot().recording, client.gui
 
@@ -203,12 +200,7 @@ class FilesPanel:
         with dialog(client, "Download results"):
             for path in files:
                 text = f"{path.name}   {size_text(path.stat().st_size)}"
-                button = client.gui.add_button(text, icon=viser.Icon.DOWNLOAD, color="gray")
-                button.on_click(partial(self._send_file, client, path))
-
-    @staticmethod
-    def _send_file(client: viser.ClientHandle, path: Path, _: object) -> None:
-        client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
+                add_button(client.gui, text, partial(_send_file, path), viser.Icon.DOWNLOAD)
 
     def ask_where(self, client: viser.ClientHandle, format: str = "") -> None:
         """Ask for a folder, the files and the choice of points, and save. format: one of `FORMATS`, chosen at first."""
@@ -256,6 +248,10 @@ class FilesPanel:
 
         save.on_click(confirmed)
         files.on_update(by_user(lambda chosen, _: setattr(of_a_run, "visible", chosen == _OF_A_RUN)))
+
+
+def _send_file(path: Path, client: viser.ClientHandle) -> None:
+    client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
 
 
 class FileList:
@@ -321,9 +317,7 @@ class FileList:
 
     def _button(self, text: str, icon: viser.IconName, act: Callable[[], None]) -> None:
         with self._place:
-            button = self._gui.add_button(text, icon=icon, color="gray")
-        button.on_click(lambda _: act())
-        self._rows.append(button)
+            self._rows.append(add_button(self._gui, text, lambda _: act(), icon))
 
     def _chosen(self, path: Path) -> None:
         try:

@@ -22,7 +22,7 @@ from app.ui.loops.words import describe_edit
 from app.ui.measure import MeasurePanel
 from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, by_user, dialog, poses_of, show
+from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, poses_of, show
 
 NOTHING, RECORDED, FILE, CONTROL = "nothing", "fixes of the recording", "fixes of a file", "control points"
 _ALIGN, _FACTORS = "align only", "as factors"
@@ -51,7 +51,7 @@ class GeoreferencePanel:
         self._control = ""
         self._nodes: list[Any] = []
         self._by = gui.add_dropdown("georeference by", (NOTHING, RECORDED, FILE, CONTROL))
-        self._choose = gui.add_button("Choose a file of fixes…", icon=viser.Icon.FOLDER_OPEN, color="gray")
+        self._choose = add_button(gui, "Choose a file of fixes…", self._browse, viser.Icon.FOLDER_OPEN)
         self._table = gui.add_folder(None, visible=False)  # an upload button cannot be hidden by itself
         with self._table:
             load = gui.add_upload_button(
@@ -72,19 +72,18 @@ class GeoreferencePanel:
         self._height = gui.add_text(
             "heights above", "", hint="The reference of the heights, for the files; empty: as in the fixes."
         )
-        self._lay = gui.add_button("Georeference the map", icon=viser.Icon.WORLD)
+        self._lay = add_button(
+            gui, "Georeference the map", lambda _: page.send(Georeference(self.survey())), viser.Icon.WORLD, color=None
+        )
         self._name = gui.add_dropdown("control point", ("–",))
         self._fit = gui.add_dropdown("pick", (_POINT, _SPHERE), hint="By a click on the map.")
         self._radius = gui.add_number("sphere's radius (m)", 0.0725, min=0.01, max=1.0, step=0.0005)
-        self._pick = gui.add_button("Pick it on the map", icon=viser.Icon.MAP_PIN)
+        self._pick = add_button(gui, "Pick it on the map", lambda _: self._begin_pick(), viser.Icon.MAP_PIN, color=None)
         self._bridge = Bridge(gui, "georeference", self._act)
         self._html = gui.add_html("")
         self._by.on_update(by_user(lambda _, __: self._show_widgets()))
         self._fit.on_update(by_user(lambda _, __: self._show_widgets()))
-        self._choose.on_click(by_user(lambda _, client: self._browse(client)))
         load.on_upload(by_user(lambda file, _: self._uploaded(file.content)))
-        self._lay.on_click(by_user(lambda _, __: page.send(Georeference(self.survey()))))
-        self._pick.on_click(by_user(lambda _, __: self._begin_pick()))
         self._show_widgets()
 
     # --- what is chosen --------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from app.ui.colours import DENSITY, DISTANCE, MODES, TABLES, Limits, value_colou
 from app.ui.files import FileList
 from app.ui.html import Tile, number, panel
 from app.ui.map_numbers import Density, MapNumbers
-from app.ui.widgets import Changes, Page, View, by_user, dialog, poses_of
+from app.ui.widgets import Changes, Page, View, add_button, dialog, poses_of
 
 _BINS: Final = 41
 _LEAST_M: Final = 0.005
@@ -46,13 +46,10 @@ class MapComparePanel:
         self._changes = Changes()
         gui.add_html(panel("quiet", _WHAT))
         self._found = gui.add_html("", visible=False)
-        self._choose = gui.add_button("Choose a map…", icon=viser.Icon.FOLDER_OPEN, color="gray", hint="PLY, LAS, LAZ.")
-        self._truth = gui.add_button(
-            "The map by the truth",
-            icon=viser.Icon.ROUTE,
-            color="gray",
-            visible=False,
-            hint="The same scans, put where the true trajectory has them.",
+        self._choose = add_button(gui, "Choose a map…", self._browse, viser.Icon.FOLDER_OPEN, hint="PLY, LAS, LAZ.")
+        hint = "The same scans, put where the true trajectory has them."
+        self._truth = add_button(
+            gui, "The map by the truth", self._by_truth, viser.Icon.ROUTE, visible=False, hint=hint
         )
         self._fit = gui.add_checkbox(
             "fit it first", False, hint="Move the other map onto this one; they must lie within 2 m and a few degrees."
@@ -61,10 +58,7 @@ class MapComparePanel:
             "reach (m)", REACH_M, min=0.05, max=5.0, step=0.05, hint="What is farther has no counterpart."
         )
         self._progress = gui.add_progress_bar(0.0, visible=False)
-        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
-        self._choose.on_click(by_user(lambda _, client: self._browse(client)))
-        self._truth.on_click(by_user(lambda _, client: self._by_truth(client)))
-        self._stop.on_click(by_user(lambda _, __: self.close()))
+        self._stop = add_button(gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False)
 
     def seen(self, current: Snapshot, view: View) -> View:
         """The view with the numbers that its colour mode needs."""
@@ -95,7 +89,7 @@ class MapComparePanel:
             nothing = "No maps (.ply, .las, .laz) here. “Save results…” writes one."
             FileList(client.gui, folders, CLOUDS, nothing, lambda path: self._begin(folders.inside(path)), close)
 
-    def _by_truth(self, client: viser.ClientHandle) -> None:
+    def _by_truth(self, _: viser.ClientHandle) -> None:
         recording = self._page.snapshot().recording
         if recording is not None and recording.truth is not None:
             self._begin(recording.truth, by_truth=True)

@@ -17,7 +17,7 @@ from app.ui.html import panel
 from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, words
 from app.ui.nodes import add_exact_points, add_lines, clear, segments
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog, poses_of
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, dialog, poses_of
 
 POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick"
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
@@ -55,8 +55,7 @@ class MeasurePanel:
         self._snap = gui.add_checkbox(
             "snap to corners", False, hint="A click near a corner means where the surfaces around meet; else an edge."
         )
-        self._save = gui.add_button("Download as CSV", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
-        self._save.on_click(by_user(lambda _, client: self._download(client)))
+        self._save = add_button(gui, "Download as CSV", self._download, viser.Icon.DOWNLOAD, visible=False)
         page.scene.on_click()(self._clicked)
 
     @property

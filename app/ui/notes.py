@@ -13,7 +13,7 @@ from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.nodes import add_exact_points, clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, dialog
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, dialog
 
 _SHOWN_NOTES: Final = 30
 _PINNED: Final = 100
@@ -37,9 +37,8 @@ class NotesPanel:
         self._pins = Pins(page, taken)
         self._bridge = Bridge(page.gui, "notes", self._act)
         self._text = page.gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
-        self._add = page.gui.add_button("Add note", icon=viser.Icon.NOTE, color="gray")
+        self._add = add_button(page.gui, "Add note", lambda _: self._note(), viser.Icon.NOTE)
         self._list = page.gui.add_html("", visible=False)
-        self._add.on_click(by_user(lambda _value, _client: self._note()))
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
         self._pins.draw(snapshot, view)

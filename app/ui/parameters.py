@@ -25,7 +25,7 @@ from app.slam.types import GROUND, SEED
 from app.ui.colours import LABEL_COLOURS
 from app.ui.html import heading, number, panel, source
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Edit, Page, as_set, by_user, dialog, show
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Edit, Page, add_button, as_set, by_user, dialog, show
 
 PRIMARY: Final = {
     "ground.scan_lines": "M scan lines",
@@ -228,16 +228,13 @@ class ParameterPanel:
         self._share_before = float("nan")  # percent of ground in the scan shown before the sliders moved
         self._ground_changes = Changes(page.now, PANEL_PERIOD_S)
         # Below the sliders and always there, so that nothing moves under the mouse.
-        self._undo, self._redo = (
-            gui.add_button(name, icon=icon, color="gray", disabled=True)
-            for name, icon in (("Undo", viser.Icon.ARROW_BACK_UP), ("Redo", viser.Icon.ARROW_FORWARD_UP))
-        )
-        self._undo.on_click(by_user(lambda _, __: self._step(-1)))
-        self._redo.on_click(by_user(lambda _, __: self._step(1)))
+        self._undo = add_button(gui, "Undo", lambda _: self._step(-1), viser.Icon.ARROW_BACK_UP, disabled=True)
+        self._redo = add_button(gui, "Redo", lambda _: self._step(1), viser.Icon.ARROW_FORWARD_UP, disabled=True)
         self._add_reset("primary")
         self._pending = gui.add_html("", visible=False)
-        self._restart = gui.add_button("Restart now", icon=viser.Icon.REFRESH, color="orange", visible=False)
-        self._restart.on_click(lambda _: self._send(Restart()))
+        self._restart = add_button(
+            gui, "Restart now", lambda _: self._send(Restart()), viser.Icon.REFRESH, color="orange", visible=False
+        )
         for section in Params.model_fields:
             with gui.add_folder(TITLES.get(section, section.title()), expand_by_default=False):
                 for leaf in self._sections[section].values():
@@ -354,10 +351,8 @@ class ParameterPanel:
 
 def add_yaml_buttons(page: Page, params: Callable[[], Params]) -> None:
     """Buttons that show the parameters as YAML to copy or download, and that load YAML."""
-    copy = page.gui.add_button("Copy as YAML", icon=viser.Icon.COPY, color="gray")
-    load = page.gui.add_button("Load YAML", icon=viser.Icon.CLIPBOARD_TEXT, color="gray")
-    copy.on_click(by_user(lambda _, client: _show_yaml(client, params())))
-    load.on_click(by_user(lambda _, client: _load_yaml(client, page)))
+    add_button(page.gui, "Copy as YAML", lambda client: _show_yaml(client, params()), viser.Icon.COPY)
+    add_button(page.gui, "Load YAML", lambda client: _load_yaml(client, page), viser.Icon.CLIPBOARD_TEXT)
 
 
 def _show_yaml(client: viser.ClientHandle, params: Params) -> None:

@@ -6,6 +6,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +20,7 @@ from app.ui.colours import Key
 from app.ui.files import result_folder_name, size_text
 from app.ui.html import panel
 from app.ui.picture_maths import Station, composed, flight
-from app.ui.widgets import Changes, Page, by_user, notify_error
+from app.ui.widgets import Changes, Page, add_button, notify_error
 
 _LARGEST: Final = 8192
 _MOST_PIXELS: Final = 6144 * 4096
@@ -49,23 +50,17 @@ class PicturesPanel:
         self._width = gui.add_number("width", 1920, min=64, max=_LARGEST, step=1, hint="Pixels.")
         self._height = gui.add_number("height", 1080, min=64, max=_LARGEST, step=1, hint="Pixels.")
         self._explain = gui.add_checkbox("with legend and scale", True)
-        shoot = gui.add_button("Take a picture", icon=viser.Icon.CAMERA, color="gray", hint="A PNG of this view.")
-        shoot.on_click(by_user(lambda _, client: self._reporting(client, self._shoot)))
+        shoot = partial(self._reporting, act=self._shoot)
+        add_button(gui, "Take a picture", shoot, viser.Icon.CAMERA, hint="A PNG of this view.")
         self._way = gui.add_dropdown("fly with", tuple(_WAYS))
         self._seconds = gui.add_number("seconds", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures each.")
-        self._start = gui.add_button(
-            "Fly along the path",
-            icon=viser.Icon.MOVIE,
-            color="gray",
-            hint="Numbered PNGs in a zip file, in this size. Keep this tab in front.",
-        )
+        hint = "Numbered PNGs in a zip file, in this size. Keep this tab in front."
+        fly = partial(self._reporting, act=self._fly)
+        self._start = add_button(gui, "Fly along the path", fly, viser.Icon.MOVIE, hint=hint)
         self._progress = gui.add_progress_bar(0.0, visible=False)
-        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
+        self._stop = add_button(gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False)
         self._where = gui.add_html("", visible=False)
-        self._download = gui.add_button("Download the flight", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
-        self._start.on_click(by_user(lambda _, client: self._reporting(client, self._fly)))
-        self._stop.on_click(by_user(lambda _, __: self._stopped.set()))
-        self._download.on_click(by_user(lambda _, client: self._send(client)))
+        self._download = add_button(gui, "Download the flight", self._send, viser.Icon.DOWNLOAD, visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
         flying = self._flying is not None and self._flying.is_alive()

@@ -17,7 +17,7 @@ from app.ui.background import Background
 from app.ui.compare import Sides
 from app.ui.html import panel
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, by_user
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_button
 
 _PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
 _LABELLED: Final = "the labelled frames"
@@ -62,17 +62,16 @@ class TunePanel:
         )
         self._search = gui.add_dropdown("search", get_args(SearchMethod), hint="How the next trials are chosen.")
         self._trials = gui.add_slider("trials", 8, 400, 8, 48)
-        self._start = gui.add_button("Start", icon=viser.Icon.PLAYER_PLAY)
-        self._stop = gui.add_button(
-            "Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False, hint="Finished runs stay."
+        self._start = add_button(gui, "Start", lambda _: self._begin(), viser.Icon.PLAYER_PLAY, color=None)
+        self._stop = add_button(
+            gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False, hint="Finished runs stay."
         )
-        self._go_on = gui.add_button("Go on", icon=viser.Icon.PLAYER_TRACK_NEXT, visible=False)
+        self._go_on = add_button(
+            gui, "Go on", lambda _: self._run(), viser.Icon.PLAYER_TRACK_NEXT, color=None, visible=False
+        )
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._bridge = Bridge(gui, "trials", self._clicked)
         self._plots = gui.add_html("", visible=False)
-        self._start.on_click(by_user(lambda _, __: self._begin()))
-        self._stop.on_click(by_user(lambda _, __: self.close()))
-        self._go_on.on_click(by_user(lambda _, __: self._run()))
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording.path if snapshot.recording else None

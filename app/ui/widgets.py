@@ -197,6 +197,19 @@ def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.G
     return callback
 
 
+def add_button(
+    gui: viser.GuiApi,
+    text: str,
+    act: Callable[[viser.ClientHandle], None],
+    icon: viser.IconName | None = None,
+    **options: Any,
+) -> viser.GuiButtonHandle:
+    """A button, gray unless it has another colour, that calls `act` with the browser it is clicked in; as `by_user`."""
+    button = gui.add_button(text, icon=icon, **({"color": "gray"} | options))
+    button.on_click(by_user(lambda _, client: act(client)))
+    return button
+
+
 def as_set(
     act: Callable[[Any, viser.ClientHandle], None],
 ) -> Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]:

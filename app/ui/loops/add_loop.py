@@ -20,7 +20,7 @@ from app.ui.loops.edges import nearest
 from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.words import NEWER, OLDER
 from app.ui.nodes import add_exact_points
-from app.ui.widgets import ROOT, Changes, Edit, Page, View, by_user, poses_of, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, poses_of, show
 
 _REST_S: Final = 0.4
 """The guess is tried after the gizmo has rested this long."""
@@ -96,7 +96,7 @@ class AddLoopPanel:
         gui.add_html(panel("text", "Tell the graph that two keyframes see the same place, whatever the search found."))
         self._older = gui.add_number("older keyframe", 0, min=0, step=1)
         self._newer = gui.add_number("newer keyframe", 0, min=0, step=1)
-        self._pick = gui.add_button(_PICK, icon=viser.Icon.POINTER, color="gray")
+        self._pick = add_button(gui, _PICK, lambda _: self._toggle_picking(), viser.Icon.POINTER)
         self._register = gui.add_checkbox(
             "register", True, hint="Register the submaps on each other. Off: the guess is used as it is."
         )
@@ -105,11 +105,9 @@ class AddLoopPanel:
             False,
             hint="First move the newer submap by arrows and rings. Off: the guess is where the graph has it.",
         )
-        self._try = gui.add_button("Try it", icon=viser.Icon.LINK)
+        self._try = add_button(gui, "Try it", lambda _: self.suggest(), viser.Icon.LINK, color=None)
         self._problem = gui.add_html("", visible=False)
-        self._pick.on_click(by_user(lambda _, __: self._toggle_picking()))
         self._nudge.on_update(by_user(self._look))
-        self._try.on_click(by_user(lambda _, __: self.suggest()))
 
     @property
     def picking(self) -> bool:

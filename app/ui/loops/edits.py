@@ -15,7 +15,7 @@ from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit, forecast, headline, reason, what_happened, what_was_undone
 from app.ui.nodes import add_lines, clear, segments
-from app.ui.widgets import ROOT, Changes, Edit, Page, by_user, poses_of, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, by_user, poses_of, show
 
 _REST_S: Final = 0.3
 _GHOST: Final[dict[bool, Rgb]] = {False: (255, 232, 70), True: (120, 90, 0)}
@@ -89,13 +89,12 @@ class Proposal:
         self._folder = gui.add_folder("Before you decide", visible=False)
         with self._folder:
             self._words = gui.add_html("")
-            self._apply = gui.add_button("Apply", icon=viser.Icon.CHECK)
-            cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
+            self._apply = add_button(gui, "Apply", lambda _: self.apply(self.command), viser.Icon.CHECK, color=None)
+            add_button(gui, "Cancel", lambda _: self.cancel(), viser.Icon.X)
         self._done = gui.add_folder("Last edit", visible=False)
         with self._done:
             self._happened = gui.add_html("")
-            self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray", hint="Ctrl Z")
-        self._undo.on_click(by_user(lambda _, __: self._send(UndoLoop())))
+            self._undo = _undo_button(page)
         self.command: LoopEdit | None = None
         self.preview: Preview | None = None
         self._asked: tuple[LoopEdit | None, object] = None, None  # tried, and of which loops
@@ -107,8 +106,6 @@ class Proposal:
         self._seen = Snapshot()
         self._last_notice = 0
         self._changes = Changes()
-        self._apply.on_click(by_user(lambda _, __: self.apply(self.command)))
-        cancel.on_click(by_user(lambda _, __: self.cancel()))
 
     def propose(self, command: LoopEdit) -> None:
         notices = self._snapshot().notices
@@ -196,28 +193,21 @@ class VerdictPanel:
         self._pair: Pair | None = None
         self._dragged: Edit | None = None
         self._headline = gui.add_html("")
-        self._accept = gui.add_button(
-            "Accept it",
-            icon=viser.Icon.THUMB_UP,
-            color="teal",
-            hint="Put it into the graph now, as a loop of its own; Undo takes that back.",
+        hint = "Put it into the graph now, as a loop of its own; Undo takes that back."
+        self._accept = add_button(
+            gui, "Accept it", lambda _: self._decide(Accept), viser.Icon.THUMB_UP, color="teal", hint=hint
         )
-        self._reject = gui.add_button(
-            "Reject it",
-            icon=viser.Icon.THUMB_DOWN,
-            color="red",
-            hint="Take it out of the graph now; Undo brings it back.",
+        hint = "Take it out of the graph now; Undo brings it back."
+        self._reject = add_button(
+            gui, "Reject it", lambda _: self._decide(Reject), viser.Icon.THUMB_DOWN, color="red", hint=hint
         )
         # In the same place, so that the way back is under the mouse. Accepting again would make a loop of its own.
-        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray", hint="Ctrl Z")
-        self._undo.on_click(by_user(lambda _, __: page.send(UndoLoop())))
+        self._undo = _undo_button(page)
         self._reason = gui.add_html("")
         self._words = gui.add_html("")
         self._weight = gui.add_slider(
             "weight", 0.1, 10.0, 0.1, 1.0, hint="Divides its covariance in the graph; 1 is as registered."
         )
-        self._accept.on_click(by_user(lambda _, __: self._decide(Accept)))
-        self._reject.on_click(by_user(lambda _, __: self._decide(Reject)))
         self._weight.on_update(by_user(lambda weight, _: self._drag(weight)))
 
     def draw(self, edge: LoopEdge | None, weighing: float | None, words: str, undo: bool) -> None:
@@ -253,23 +243,25 @@ class VerdictPanel:
             self._apply(verb(*self._pair))
 
 
+def _undo_button(page: Page) -> viser.GuiButtonHandle:
+    return add_button(page.gui, "Undo", lambda _: page.send(UndoLoop()), viser.Icon.ARROW_BACK_UP, hint="Ctrl Z")
+
+
 class EditsPanel:
     """Undo, redo, and the list of edits as a file."""
 
     def __init__(self, page: Page) -> None:
         gui, send = page.gui, page.send
         self._send, self._snapshot = send, page.snapshot
-        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray", hint="Ctrl Z")
-        self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray", hint="Ctrl Shift Z")
-        self._save = gui.add_button(
-            "Save edits", icon=viser.Icon.DOWNLOAD, color="gray", hint="As edits.yaml for `hemislam run --loops`."
+        self._undo = _undo_button(page)
+        self._redo = add_button(
+            gui, "Redo", lambda _: send(RedoLoop()), viser.Icon.ARROW_FORWARD_UP, hint="Ctrl Shift Z"
         )
+        hint = "As edits.yaml for `hemislam run --loops`."
+        self._save = add_button(gui, "Save edits", self._download, viser.Icon.DOWNLOAD, hint=hint)
         load = gui.add_upload_button(
             "Load edits …", icon=viser.Icon.UPLOAD, color="gray", mime_type=".yaml,.yml,text/*"
         )
-        self._undo.on_click(by_user(lambda _, __: send(UndoLoop())))
-        self._redo.on_click(by_user(lambda _, __: send(RedoLoop())))
-        self._save.on_click(by_user(lambda _, client: self._download(client)))
         load.on_upload(by_user(lambda file, _: self._load(file.content)))
         gui.add_command("Undo the last edit of a loop", hotkey="Z", modifier="cmd/ctrl").on_trigger(
             lambda _: send(UndoLoop())

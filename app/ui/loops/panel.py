@@ -21,7 +21,7 @@ from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
 from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, forecast, kind_of, largest_factors, name
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, poses_of
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, poses_of
 
 _STEPS: Final = 14
 _STEP_S: Final = 0.03
@@ -82,13 +82,16 @@ class LoopsPanel:
             self._edits = EditsPanel(page)
         self._residuals_folder = gui.add_folder("Graph residuals", expand_by_default=False, visible=False)
         with self._residuals_folder:
-            self._solve = gui.add_button(
-                "Solve all at once …", icon=viser.Icon.MATH_FUNCTION, color="gray", hint=_SOLVE_HINT
+            self._solve = add_button(
+                gui,
+                "Solve all at once …",
+                lambda _: self._proposal.propose(Solve()),
+                viser.Icon.MATH_FUNCTION,
+                hint=_SOLVE_HINT,
             )
             self._solving = gui.add_html(
                 panel("text", "What it would change is shown above, under “Before you decide”."), visible=False
             )
-            self._solve.on_click(by_user(lambda _, __: self._proposal.propose(Solve())))
             self._factors = gui.add_html("")
         gui.add_command("Next loop of the table", hotkey="J").on_trigger(lambda _: self._step(1))
         gui.add_command("Previous loop of the table", hotkey="K").on_trigger(lambda _: self._step(-1))
