@@ -115,10 +115,6 @@ class Workspace:
         """The newest one of A."""
         return self._sides[0].engine.snapshot
 
-    @property
-    def pid(self) -> int | None:
-        return self._sides[0].engine.pid
-
     def send(self, command: Command) -> None:
         """Enqueue a command for A; a comparison is sent to B as well."""
         self._sides[0].engine.send(command)

@@ -129,7 +129,7 @@ class ComparePanel:
         self._scene_changes, self._pair_changes = Changes(page.now, SCENE_PERIOD_S), Changes()
         self._panel_changes = Changes(page.now, PANEL_PERIOD_S)
 
-        self._status = gui.add_html(maths.status(None, None, ("", ""), -1))
+        self._status = gui.add_html(panel("no_fork"))
         self._name = gui.add_text("name", "", hint="Of the fork, and of its file when you keep it.")
         hint = "Continue from this frame with other parameters, side by side."
         self._fork = add_button(gui, "Fork here", lambda _: self._begin(), viser.Icon.GIT_BRANCH, color=None, hint=hint)

@@ -124,9 +124,9 @@ def thinned(stamps: F64, *columns: F64) -> tuple[F64, ...]:
 
 
 # --- words ---------------------------------------------------------------------------------------
-def status(a: Snapshot | None, b: Snapshot | None, names: tuple[str, str], forked_at: int) -> str:
+def status(a: Snapshot, b: Snapshot | None, names: tuple[str, str], forked_at: int) -> str:
     """Who A and B are, and how B is doing; without a fork, what one is for."""
-    if a is None or b is None:
+    if b is None:
         return panel("no_fork")
     return panel("fork", names, forked_at, (A_COLOUR, B_COLOUR), *how(a, b))
 

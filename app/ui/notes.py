@@ -33,36 +33,36 @@ class NotesPanel:
     """
 
     def __init__(self, page: Page, taken: Callable[[], bool] = lambda: False) -> None:
-        self._send, self._snapshot = page.send, page.snapshot
-        self._pins = Pins(page, taken)
+        self._page, self._taken = page, taken
+        self._changes = Changes()
+        self._nodes: list[viser.SceneNodeHandle] = []
+        self._pinned: list[tuple[int, str]] = []  # frame and text
+        self._where: F64 = np.empty((0, 3))
         self._bridge = Bridge(page.gui, "notes", self._act)
         self._text = page.gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
         self._add = add_button(page.gui, "Add note", lambda _: self._note(), viser.Icon.NOTE)
         self._list = page.gui.add_html("", visible=False)
+        page.scene.on_click()(self._clicked)
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
-        self._pins.draw(snapshot, view)
+        self._draw_pins(snapshot, view)
         listed = list(enumerate(snapshot.notes))[-_SHOWN_NOTES:][::-1]
         self._list.content = self._bridge.live(panel("notes", listed)) if listed else ""
         self._list.visible = bool(snapshot.notes)
 
-    def points_at(self, event: viser.SceneClickEvent) -> bool:
-        """Whether a click is on a pin."""
-        return self._pins.at(event) is not None
-
     def _note(self) -> None:
         if self._text.value.strip():
-            self._send(AddNote(self._text.value))
+            self._page.send(AddNote(self._text.value))
             self._text.value = ""  # type: ignore[misc]  # mypy overlooks viser's setter
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
         """What the list sends: "go 812", "edit 3", "delete 3"."""
         verb, _, text = word.partition(" ")
-        number, notes = int(text) if text.isdecimal() else -1, self._snapshot().notes
+        number, notes = int(text) if text.isdecimal() else -1, self._page.snapshot().notes
         if verb == "go" and number >= 0:
-            self._send(Seek(number))
+            self._page.send(Seek(number))
         elif 0 <= number < len(notes) and verb == "delete":
-            self._send(EditNote(number, notes[number].text, ""))
+            self._page.send(EditNote(number, notes[number].text, ""))
         elif 0 <= number < len(notes) and verb == "edit":
             self._ask(number, notes[number].text, client)
 
@@ -72,25 +72,14 @@ class NotesPanel:
             keep = client.gui.add_button("Keep", icon=viser.Icon.CHECK)
 
         def kept(_: object) -> None:
-            self._send(EditNote(place, before, text.value))
+            self._page.send(EditNote(place, before, text.value))
             close()
 
         keep.on_click(kept)
 
-
-class Pins:
-    """A knob and a label for every frame with notes; a click goes to that frame."""
-
-    def __init__(self, page: Page, taken: Callable[[], bool]) -> None:
-        self._page, self._taken = page, taken
-        self._changes = Changes()
-        self._nodes: list[viser.SceneNodeHandle] = []
-        self._pinned: list[tuple[int, str]] = []  # frame and text
-        self._where: F64 = np.empty((0, 3))
-        page.scene.on_click()(self._clicked)
-
-    def draw(self, snapshot: Snapshot, view: View) -> None:
-        """Pin the newest notes of frames that the trajectory reaches, sending what differs."""
+    # --- pins ------------------------------------------------------------------------------------
+    def _draw_pins(self, snapshot: Snapshot, view: View) -> None:
+        """Pin the newest notes of frames that the trajectory reaches."""
         path = snapshot.trajectory if snapshot.trajectory is not None else np.empty((0, 3))
         pinned = pins(snapshot.notes, len(path)) if view.notes else []
         where = path[[frame for frame, _ in pinned]].reshape(-1, 3)
@@ -102,10 +91,9 @@ class Pins:
         if pinned:
             self._nodes.append(add_exact_points(scene, f"{root}/knobs", where.astype(np.float32), _PIN_COLOUR, _PIN_M))
         for (frame, text), position in zip(pinned, where, strict=True):
-            label = scene.add_label(f"{root}/{frame}", text, position=position, anchor="center-left")
-            self._nodes.append(label)
+            self._nodes.append(scene.add_label(f"{root}/{frame}", text, position=position, anchor="center-left"))
 
-    def at(self, event: viser.SceneClickEvent) -> int | None:
+    def pin_at(self, event: viser.SceneClickEvent) -> int | None:
         """The frame of the pin that was clicked."""
         if not self._pinned or self._taken():
             return None
@@ -117,8 +105,7 @@ class Pins:
         return self._pinned[int(hit[np.hypot(x, y)[hit].argmin()])][0] if len(hit) else None
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        frame = self.at(event)
-        if frame is not None:
+        if (frame := self.pin_at(event)) is not None:
             self._page.send(Seek(frame))
 
 

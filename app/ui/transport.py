@@ -6,6 +6,8 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any, Final
 
+import viser
+
 from app.mapping.breakpoints import BREAKPOINTS, Breakpoints
 from app.server.protocol import (
     Pause,
@@ -31,8 +33,6 @@ SPEEDS: Final = {
     "10×": 10.0,
     "maximum": math.inf,
 }
-_SWITCHES: Final = tuple(one for one in BREAKPOINTS if one.limit is None)
-_LIMITS: Final = tuple((one, one.limit) for one in BREAKPOINTS if one.limit is not None)
 
 
 class TransportPanel:
@@ -158,14 +158,16 @@ class BreakpointPanel:
         gui = page.gui
         self._send = page.send
         self._shown = Breakpoints()
-        self._switches = {one.name: gui.add_checkbox(one.title, False, hint=one.hint) for one in _SWITCHES}
-        self._limits = {}
-        for one, limit in _LIMITS:
-            switch = gui.add_checkbox(one.title, False, hint=one.hint)
-            number = gui.add_number(limit.unit or "limit", limit.default, min=0.0, step=limit.step)
-            number.visible = False
-            self._limits[one.name] = switch, number
-        for control in (*self._switches.values(), *(part for pair in self._limits.values() for part in pair)):
+        self._switches: dict[str, viser.GuiCheckboxHandle] = {}
+        self._numbers: dict[str, viser.GuiNumberHandle[float]] = {}  # of those that have a limit
+        for one in BREAKPOINTS:
+            self._switches[one.name] = gui.add_checkbox(one.title, False, hint=one.hint)
+            if (limit := one.limit) is not None:
+                self._numbers[one.name] = gui.add_number(
+                    limit.unit or "limit", limit.default, min=0.0, step=limit.step, visible=False
+                )
+        controls: list[Any] = [*self._switches.values(), *self._numbers.values()]
+        for control in controls:
             control.on_update(as_set(lambda _value, _client: self._changed()))
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -173,19 +175,17 @@ class BreakpointPanel:
         if now == self._shown:  # a control just set stays until the engine has heard of it
             return
         self._shown = now
-        for name, switch in self._switches.items():
-            show(switch, now[name])
-        for one, limit in _LIMITS:
-            switch, number = self._limits[one.name]
-            value = now[one.name]
-            show(switch, value is not None)
-            number.visible = value is not None
-            if value is not None:
-                show(number, round(limit.scale * value, 6))
+        for one in BREAKPOINTS:
+            show(self._switches[one.name], one.name in now.chosen)
+            if one.limit is not None:
+                self._numbers[one.name].visible = one.name in now.chosen
+                if one.name in now.chosen:
+                    show(self._numbers[one.name], round(one.limit.scale * now.chosen[one.name], 6))
 
     def _changed(self) -> None:
         chosen: dict[str, Any] = {name: switch.value for name, switch in self._switches.items()}
-        for one, limit in _LIMITS:
-            switch, number = self._limits[one.name]
-            chosen[one.name] = max(number.value, 0.0) / limit.scale if switch.value else None
+        for one in BREAKPOINTS:
+            if one.limit is not None:
+                value = max(self._numbers[one.name].value, 0.0) / one.limit.scale
+                chosen[one.name] = value if chosen[one.name] else None
         self._send(SetBreakpoints(Breakpoints(**chosen)))

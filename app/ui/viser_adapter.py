@@ -50,8 +50,3 @@ class Bridge:
     def live(self, html: str) -> str:
         """HTML whose elements with `data-hs` can be clicked."""
         return panel("bridged", self._name, html)
-
-
-def add_opened(gui: viser.GuiApi, act: Callable[[str], None]) -> None:
-    """Call `act` with the name of each tab that a browser opens, and with "" for Escape outside a dialog."""
-    gui.add_html(Bridge(gui, "opened", lambda tab, _: act(tab)).live(panel("opened")))

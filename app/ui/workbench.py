@@ -30,7 +30,7 @@ from app.ui.colours import DIMMED, Rgb
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
 from app.ui.georeference import GeoreferencePanel
-from app.ui.html import render
+from app.ui.html import panel, render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
 from app.ui.map_compare import MapComparePanel
@@ -47,7 +47,7 @@ from app.ui.study import StudyPanel
 from app.ui.timeline import TimelinePanel
 from app.ui.transport import BreakpointPanel, TransportPanel
 from app.ui.tune import TunePanel
-from app.ui.viser_adapter import add_opened, prepare_page
+from app.ui.viser_adapter import Bridge, prepare_page
 from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 
 log = logging.getLogger(__name__)
@@ -98,7 +98,7 @@ class Workbench:
         legend = gui.add_html("")
         files = FilesPanel(page, folders, results)
         self._recent = RecentPanel(page, folders, results / "sessions", files.browse)
-        add_opened(gui, self._opened)
+        gui.add_html(Bridge(gui, "opened", lambda tab, _: self._opened(tab)).live(panel("opened")))
         tabs = gui.add_tab_group()
         with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._sides = Sides(gui, forks)
@@ -172,8 +172,8 @@ class Workbench:
     def close(self) -> None:
         """Stop drawing; the page stays as it is until its server stops."""
         self._stop.set()
-        for panel in (self._calibration, self._tune, self._map_compare, self._pictures):
-            panel.close()
+        for working in (self._calibration, self._tune, self._map_compare, self._pictures):
+            working.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
@@ -200,8 +200,8 @@ class Workbench:
         self._measure.draw(current, view)
         self._brush.draw(current, view)
         self._notes.draw(current, view)
-        for panel in self._panels:
-            panel.draw(current)
+        for one in self._panels:
+            one.draw(current)
         self._scale.draw()
 
     def _lines(self, current: Snapshot, view: View) -> list[tuple[Rgb, str]]:
@@ -213,7 +213,7 @@ class Workbench:
 
     def _picks(self, click: viser.SceneClickEvent) -> bool:
         """Whether a click picks a point to measure, or goes to a note."""
-        return self._measure.picking or self._notes.points_at(click)
+        return self._measure.picking or self._notes.pin_at(click) is not None
 
     def _opened(self, tab: str) -> None:
         """Another tab, or "" for Escape, ends what was looked at under the one before. View changes only looks."""

@@ -248,7 +248,7 @@ from app.server.worker import EngineProcess
 
 class Page:
     def __init__(self, viser, engine, folders): self.engine = engine
-    def start(self): print("engine", self.engine.pid, flush=True)
+    def start(self): print("engine", self.engine._sides[0].engine.pid, flush=True)
     def close(self): print("page closed", flush=True)
 
 if __name__ == "__main__":

@@ -258,7 +258,7 @@ def test_switches_and_limits_are_sent_in_si_units(server: viser.ViserServer) -> 
     panel = BreakpointPanel(page_of(server, sent.append))
     user_sets(panel._switches["no_ground"], True)
     assert sent[-1] == SetBreakpoints(Breakpoints(no_ground=True))
-    switch, number = panel._limits["residual"]
+    switch, number = panel._switches["residual"], panel._numbers["residual"]
     user_sets(switch, True)
     user_sets(number, 30.0)
     assert sent[-1] == SetBreakpoints(Breakpoints(no_ground=True, residual=0.03))
@@ -270,7 +270,7 @@ def test_what_another_page_chose_is_shown_and_not_sent_back(server: viser.ViserS
     sent: list[Command] = []
     panel = BreakpointPanel(page_of(server, sent.append))
     panel.draw(Snapshot(breakpoints=Breakpoints(dropped=True, error=0.25)))
-    switch, number = panel._limits["error"]
+    switch, number = panel._switches["error"], panel._numbers["error"]
     assert panel._switches["dropped"].value and switch.value and number.visible and number.value == 25.0
     assert sent == []
 

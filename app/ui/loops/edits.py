@@ -13,7 +13,7 @@ from app.slam.loops.types import LoopEdge, Pair, Preview, Verdict
 from app.slam.types import F32, F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
-from app.ui.loops.words import describe_edit, forecast, headline, reason, what_happened, what_was_undone
+from app.ui.loops.words import BRIDGE, describe_edit, forecast, kind_of, what_happened, what_was_undone
 from app.ui.nodes import add_lines, clear, segments
 from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, by_user, poses_of, show
 
@@ -221,8 +221,10 @@ class VerdictPanel:
         if edge is None:
             self._dragged = None
             return
-        self._headline.content = headline(edge)
-        self._reason.content, self._words.content = reason(edge), words
+        colour = kind_of(edge).colour
+        self._headline.content = panel("loops.headline", edge, colour)
+        self._reason.content = panel("bridged", BRIDGE, panel("loops.reason", edge, colour))
+        self._words.content = words
         self._undo.visible = undo
         self._accept.visible = not undo and edge.verdict is not Verdict.ACCEPTED
         self._reject.visible = not undo and edge.verdict is not Verdict.REJECTED

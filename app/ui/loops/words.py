@@ -104,16 +104,6 @@ def what_was_undone(command: LoopEdit, edges: tuple[LoopEdge, ...], before: F64,
     return panel("loops.happened", what, _moves(after, before), "back ")
 
 
-def headline(edge: LoopEdge) -> str:
-    """Which loop it is, and its verdict."""
-    return panel("loops.headline", edge, kind_of(edge).colour)
-
-
-def reason(edge: LoopEdge) -> str:
-    """Why it has its verdict; loops that contradict it can be clicked, as rows of the table."""
-    return panel("bridged", BRIDGE, panel("loops.reason", edge, kind_of(edge).colour))
-
-
 def evidence(edge: LoopEdge, params: LoopsParams) -> str:
     """The numbers of a loop, green or red by the present limits."""
     e = edge.evidence

@@ -7,8 +7,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from app.server.protocol import InspectLoop, Seek, TryLoop
+from app.ui.html import panel
 from app.ui.loops.inspector import CLOSE, SEEK
-from app.ui.loops.words import reason
 from tests.ui.conftest import SOMEONE, Wire, user_clicks, user_sets
 from tests.ui.loops.conftest import GOOD, NEWER, OLDER, Page
 
@@ -97,8 +97,9 @@ def test_a_page_with_a_chosen_loop_and_a_ghost_at_rest_sends_nothing(page: Page,
 
 def test_a_loop_that_another_is_in_the_graph_for_says_which(page: Page) -> None:
     edge = next(edge for edge in page.engine.snapshot.loops.edges if edge.counts)
-    assert "corrects the map" not in reason(edge)
-    assert "loop 12–340 close by corrects the map for both" in reason(replace(edge, represented_by=(12, 340)))
+    other = replace(edge, represented_by=(12, 340))
+    assert "corrects the map" not in panel("loops.reason", edge, (0, 0, 0))
+    assert "loop 12–340 close by corrects the map for both" in panel("loops.reason", other, (0, 0, 0))
 
 
 def test_the_legend_names_the_loops_and_the_two_submaps(page: Page) -> None:
