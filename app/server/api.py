@@ -273,7 +273,6 @@ def _send(engine: RunningEngine, command: Command) -> None:
 
 
 def _note(engine: RunningEngine, place: int) -> str:
-    """The text of the note with this place."""
     notes = engine.snapshot.notes
     if place >= len(notes):
         raise HTTPException(404, f"There are {len(notes)} notes.")

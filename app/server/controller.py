@@ -198,7 +198,6 @@ class Controller:
         self._page.put(**others, urgent=bool(others))
 
     def _show_params(self) -> None:
-        """Show the parameters, and which of them wait for a restart."""
         session = self._player.session
         pending = tuple(session.params.changed(self._params)) if session is not None else ()
         self._page.put(params=self._params, pending_restart=pending, urgent=True)
@@ -218,7 +217,6 @@ class Controller:
         return wait
 
     def _write(self, session: Session) -> None:
-        """Write the session file; say it if that fails for the first time."""
         kept = not self._writer.error
         self._writer.write(session.frame, self._state(session), ended=session.ended, known=session.furthest)
         if kept and self._writer.error:
@@ -263,7 +261,6 @@ class Controller:
         return min((seconds for seconds in waits if seconds is not None), default=None)
 
     def _state(self, session: Session) -> State:
-        """What a session file needs to repeat the session."""
         return State(
             params=self._params,
             history=session.history,
@@ -364,7 +361,6 @@ class Controller:
         self._show_params()
 
     def _begin_file(self, session: Session) -> None:
-        """Begin a session file, if the session can be repeated."""
         self._writer.close()
         self._writer = SessionWriter()
         if self._session_folder is not None and session.feed.repeatable:

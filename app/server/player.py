@@ -213,7 +213,6 @@ class Player:
         self._page.notice("error", f"{what}. {reason}")
 
     def _advance(self, session: Session, target: SeekTarget | None) -> float | None:
-        """Process the next frame if it is due."""
         revisited = session.revisits
         try:
             entry = session.peek()

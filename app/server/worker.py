@@ -104,7 +104,6 @@ class EngineProcess:
         threading.Thread(target=self._follow, args=(child,), name="engine updates", daemon=True).start()
 
     def _follow(self, child: Child) -> None:
-        """Apply what the process sends, until it ends."""
         try:
             while True:
                 delta = child.receive()

@@ -127,7 +127,6 @@ class BrushPanel:
             self._page.send(Paint(Stroke.of(result.stamp_ns, touched, self._mark)))
 
     def _mark_rest(self) -> None:
-        """The engine's labels for all points without a mark."""
         if (result := self._frame()) is None:
             return
         found = marks(self._page.snapshot().painted).get(result.stamp_ns)

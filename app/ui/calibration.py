@@ -112,7 +112,6 @@ class CalibrationPanel:
         return any(one.number > self._heard and one.text.startswith(IN_DOUBT) for one in snapshot.notices)
 
     def _announce(self) -> None:
-        """Say in each browser why the map may look wrong."""
         for number, client in self._page.server.get_clients().items():
             if number not in self._notified:
                 self._notified.add(number)

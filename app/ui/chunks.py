@@ -2,7 +2,7 @@
 
 A keyframe's points are sent once, in its LiDAR frame; when its pose changes later, 7 numbers are sent.
 Of a map larger than the page's budget of points only a part of each keyframe is sent, and again when that part changes
-because someone looks from elsewhere (`app.ui.detail`). Of a huge map snapshots hold some keyframes with fewer points.
+because someone looks from elsewhere (`parts`). Of a huge map snapshots hold some keyframes with fewer points.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,6 @@ from app.server.setup import POINT_BUDGET
 from app.slam import lie
 from app.slam.types import F32, F64, I64, MOVING, U8
 from app.ui.colours import BY_POSE, DIMMED, INTENSITY, MODES, Limits, PointSet, chosen_ends, colours, grown
-from app.ui.detail import parts
 from app.ui.geometry import STILL_M
 from app.ui.nodes import add_points, place
 from app.ui.shading import light
@@ -33,10 +32,38 @@ _SIZE_BY_GAP: Final = 0.5
 _GAP_BY_SHARE: Final = 0.25
 """How gaps grow with the number of points left out: by its square root, but other keyframes fill half of them."""
 _NO_EYES: Final[F64] = np.zeros((0, 3))
+_NEAR_M: Final = 3.0
+_COARSEST: Final = -12.0
+"""Nearer keyframes are drawn as at this distance, and of each at least this power of two of its points."""
 _AT_ONCE: Final = 300_000
 """Most points by which known keyframes grow at once: what is nearest comes first."""
 _SAMPLE: Final = 200
 """Points of each keyframe that say how large the map is."""
+
+
+def parts(counts: I64, positions: F64, eyes: F64, most: int) -> I64:
+    """(k,) how many of each keyframe's points to draw, at most `most` in all; all of them, if these are no more.
+
+    A keyframe twice as far away has a quarter of the points: in the picture they are as dense. Shares are powers of a
+    half, so that few keyframes change as an eye moves.
+
+    Args:
+        counts: (k,) points of each keyframe. positions: (k, 3) m. eyes: (e, 3) m, where cameras are.
+    """
+    if counts.sum() <= most:
+        return counts
+    away = np.linalg.norm(positions[:, None] - eyes[None], axis=2).min(axis=1, initial=1e6)
+    density = -2 * np.log2(np.maximum(away, _NEAR_M))
+
+    def drawn(level: float) -> I64:
+        shares = np.exp2(np.clip(np.floor(density + level), _COARSEST, 0.0))
+        return np.asarray(counts * shares, np.int64)
+
+    low, high = 0.0, 2 * np.log2(1e6) + 1
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (middle, high) if drawn(middle).sum() <= most else (low, middle)
+    return drawn(low)
 
 
 @dataclass(slots=True)
@@ -210,7 +237,6 @@ class MapChunks:
         return shown_points(drawn.chunk, T_map_lidar, view.ceilings, view.clip, drawn.part, moving=view.moving)
 
     def _shows_others(self, drawn: _Drawn, index: int) -> bool:
-        """Whether other points of it are to be shown than those that were sent."""
         return not np.array_equal(self._chosen(drawn, self._T_map_imu[index]), drawn.shown)
 
     def _send(self, drawn: _Drawn, T_map_imu: F64) -> None:

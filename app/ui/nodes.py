@@ -112,21 +112,18 @@ class Truth:
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene = scene
         self._root = root
-        self._line: viser.LineSegmentsHandle | None = None
+        self._lines: list[viser.LineSegmentsHandle] = []  # one, or none
         self._loaded: F64 | None = None
 
     def draw(self, positions: F64 | None, T_map_truth: F64 | None, visible: bool) -> None:
         """Show (m, 3) positions where `T_map_truth` (4, 4) puts them; hidden while that is unknown."""
         if positions is not self._loaded:
             self._loaded = positions
-            if self._line is not None:
-                self._line.remove()
-                self._line = None
+            clear(self._lines)
             if positions is not None and len(positions) >= 2:
                 some = positions[:: max(1, len(positions) // _MOST_TRUTH_POINTS)]
-                self._line = add_lines(self._scene, self._root, segments(some), TRUTH_COLOUR, 1.5, visible=False)
-        if self._line is None:
-            return
-        self._line.visible = visible and T_map_truth is not None
-        if T_map_truth is not None:
-            place(self._line, T_map_truth)
+                self._lines = [add_lines(self._scene, self._root, segments(some), TRUTH_COLOUR, 1.5, visible=False)]
+        for line in self._lines:
+            line.visible = visible and T_map_truth is not None
+            if T_map_truth is not None:
+                place(line, T_map_truth)

@@ -133,7 +133,6 @@ def _number(gui: viser.GuiApi, leaf: Leaf, value: float, text: str) -> list[Widg
 
 
 def _component(gui: viser.GuiApi, leaf: Leaf, vector: tuple[float, ...], index: int, name: str) -> list[Widget]:
-    """The widgets of one number of a vector."""
 
     def of_vector(one: Widget) -> Widget:
         return Widget(
@@ -275,7 +274,6 @@ class ParameterPanel:
         self._pending.content = panel("pending", snapshot.pending_restart)
 
     def _show_ground(self, snapshot: Snapshot, tuning: bool) -> None:
-        """What the four sliders made of the present scan."""
         ground = snapshot.result.ground if snapshot.result is not None else None
         if not tuning:
             self._share_before = 100 * ground.share if ground is not None else float("nan")
@@ -287,7 +285,6 @@ class ParameterPanel:
             self._ground.content = panel("ground_now", _COLOURS, share, was, seeds, why)
 
     def _step(self, by: int) -> None:
-        """Undo or redo the last change of parameters."""
         values = self._history.change(by)
         if values:
             self._history.go(by)

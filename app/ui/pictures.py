@@ -87,7 +87,8 @@ class PicturesPanel:
 
     def _shoot(self, client: viser.ClientHandle) -> None:
         camera, (key, light) = client.camera, self._key()
-        rendered = self._rendered(client, None)
+        station = Station(np.array(camera.position), np.array(camera.wxyz), camera.fov)
+        rendered = self._rendered(client, station)
         away = float(np.linalg.norm(np.array(camera.position) - camera.look_at))
         png = self._png(rendered, key, light, 2 * away * float(np.tan(camera.fov / 2)))
         client.send_file_download(f"{self._name()}.png", png, save_immediately=True)
@@ -100,16 +101,9 @@ class PicturesPanel:
         composed(rendered, key, light=light, seen_m=seen_m).save(file, "PNG", compress_level=3)
         return file.getvalue()
 
-    def _rendered(self, client: viser.ClientHandle, station: Station | None) -> U8:
-        """(h, w, 4) what the browser sees from a station, or from where its camera is.
-
-        Raises:
-            HemislamError: it sends no picture.
-        """
+    def _rendered(self, client: viser.ClientHandle, station: Station) -> U8:
+        """(h, w, 4) what the browser sees from a station. Raises HemislamError: it sends no picture."""
         width, height = self._size()
-        camera = client.camera
-        if station is None:
-            station = Station(np.array(camera.position), np.array(camera.wxyz), camera.fov)
         try:
             rendered: U8 = client.get_render(
                 height,
@@ -172,7 +166,6 @@ class PicturesPanel:
         client.send_file_download(self._saved.name, self._saved.read_bytes(), save_immediately=True)
 
     def _reporting(self, client: viser.ClientHandle, act: Callable[[viser.ClientHandle], None]) -> None:
-        """Do something, and report to the browser if it fails."""
         problem = ""
         try:
             act(client)

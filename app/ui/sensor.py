@@ -47,16 +47,14 @@ class SensorScene:
         self._plane = scene.add_frame(f"{below}/plane", show_axes=False)
         add_surface(scene, f"{below}/plane/disc", vertices, faces, ground, 0.16)
         add_lines(scene, f"{below}/plane/rim", rim, ground, 2.0)
-        self._elevations: F64 = np.empty(0)
-        self._height = 1.3
         self._clip: Box | None = None
-        self.ground_z: float | None = None
+        self.clear()
 
     def clear(self) -> None:
         self._imu.visible = False
-        self._elevations = np.empty(0)
+        self._elevations: F64 = np.empty(0)
         self._height = 1.3
-        self.ground_z = None
+        self.ground_z: float | None = None
 
     def draw(
         self,

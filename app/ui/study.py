@@ -48,26 +48,20 @@ class StudyScene:
         self._scene = scene
         self._map = f"{ROOT}/study"
         self._lidar = scene.add_frame(self._map, show_axes=False)
-        self._cloud: viser.PointCloudHandle | None = None
+        self._cloud: list[viser.PointCloudHandle] = []  # one, or none
         self._marks: list[Any] = []
 
     def draw_cloud(self, result: StepResult | None, by: str, size: float) -> None:
         """The frame coloured by a number; nothing for `AS_MAP`."""
         points = STUDY_MODES[by].points(result) if result is not None and by != AS_MAP else ()
         if result is None or len(points) == 0:
-            if self._cloud is not None:
-                self._cloud.remove()
-                self._cloud = None
+            clear(self._cloud)
             return
         place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
         shown = shown_of(len(points))
-        self._cloud = add_points(
-            self._scene,
-            f"{self._map}/cloud",
-            np.asarray(points)[shown],
-            study_colours(result, by)[shown],
-            size * (2.2 if by == RESIDUAL else SCAN_POINT_SCALE),
-        )
+        colours = study_colours(result, by)[shown]
+        size *= 2.2 if by == RESIDUAL else SCAN_POINT_SCALE
+        self._cloud = [add_points(self._scene, f"{self._map}/cloud", np.asarray(points)[shown], colours, size)]
 
     def draw_picked(self, result: StepResult | None, picked: Picked | None, size: float) -> None:
         """Mark a point, its neighbours, the plane through them and the map's plane nearby."""

@@ -12,8 +12,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from app.server.protocol import Chunk, Seek, Snapshot
-from app.slam.loops.types import LoopEdge, Pair, Verdict
+from app.server.protocol import Seek, Snapshot
+from app.slam.loops.types import Pair, Verdict
 from app.slam.types import F64, I64
 from app.ui.html import panel
 from app.ui.widgets import Changes, Page
@@ -112,7 +112,7 @@ class History:
         self._session = -1
         self._truth: Path | None = None
         self._columns: dict[str, F64] = {}  # (total,) by strip and for stamps, nan where unknown
-        self._loops: dict[Pair, tuple[int, Verdict]] = {}
+        self._loops: dict[Pair, tuple[int, Verdict]] = {}  # when each candidate got which verdict
 
     def see(self, snapshot: Snapshot) -> None:
         """Take in what a snapshot says of all frames up to its newest."""
@@ -131,12 +131,14 @@ class History:
         if truth != self._truth:
             self._columns["error"][count:] = np.nan  # they are distances to another truth
         later = {pair: entry for pair, entry in self._loops.items() if entry[0] >= count}
-        self._loops = later | loop_frames(snapshot.loops.edges, snapshot.chunks)
+        edges, chunks = snapshot.loops.edges, snapshot.chunks
+        here = [edge for edge in edges if edge.decided_at < len(chunks)]  # others are of keyframes that come later
+        self._loops = later | {edge.pair: (chunks[edge.decided_at].frame, edge.verdict) for edge in here}
         self._truth, self.present = truth, count - 1
 
-    def columns(self, most: int = COLUMNS) -> "Columns":
-        """Everything, thinned to at most `most` columns of equally many frames."""
-        count = min(self.total, most)
+    def columns(self) -> "Columns":
+        """Everything, thinned to columns of equally many frames."""
+        count = min(self.total, COLUMNS)
         starts = np.arange(count) * self.total // count
         loops: dict[str, list[int]] = {verdict: [0] * count for verdict in Verdict}
         for frame, verdict in self._loops.values():
@@ -171,11 +173,6 @@ class Columns:
     loops: dict[str, list[int]]
 
 
-def loop_frames(edges: tuple[LoopEdge, ...], chunks: tuple[Chunk, ...]) -> dict[Pair, tuple[int, Verdict]]:
-    """The frame at which each candidate got its verdict, and the verdict; without those of keyframes not here yet."""
-    return {edge.pair: (chunks[edge.decided_at].frame, edge.verdict) for edge in edges if edge.decided_at < len(chunks)}
-
-
 def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
     """What the page's script draws (`templates/transport.js`), as JSON-ready values."""
     columns, bad = history.columns(), limits(snapshot)
@@ -189,13 +186,8 @@ def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
         usual = float(np.percentile(finite, 98)) if len(finite) else 0.0
         strips.append(
             {
-                "name": strip.name,
-                "unit": strip.unit,
-                "digits": strip.digits,
-                "colour": strip.colour,
-                "hint": strip.hint,
+                **{name: getattr(strip, name) for name in ("name", "unit", "digits", "colour", "hint", "bars")},
                 "low": strip.worse == "low",
-                "bars": strip.bars,
                 "top": strip.least if strip.worse == "low" else max(strip.least, 1.2 * usual),
                 "limit": bad.get(strip.key),
                 "data": packed(np.concatenate((low, high))),
@@ -245,7 +237,6 @@ class TimelinePanel:
         self._data.content = panel("timeline_data", text)
 
     def _jump(self, by: int) -> None:
-        """To the next frame, or the one before, at which a problem begins."""
         snapshot = self._page.snapshot()
         here, frames = snapshot.transport.frame, self._history.troubles(limits(snapshot))
         there = next((frame for frame in frames[::by] if (frame - here) * by > 0), None)

@@ -212,7 +212,6 @@ class Workbench:
         return [*self._loops.keys(current, view.light), *path, *dimmed]
 
     def _picks(self, click: viser.SceneClickEvent) -> bool:
-        """Whether a click picks a point to measure, or goes to a note."""
         return self._measure.picking or self._notes.pin_at(click) is not None
 
     def _opened(self, tab: str) -> None:

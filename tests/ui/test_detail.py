@@ -1,12 +1,12 @@
 """Which part of a large map is drawn.
 
-Tests app/ui/detail.py.
+Tests app/ui/chunks.py.
 """
 
 import numpy as np
 import pytest
 
-from app.ui.detail import parts
+from app.ui.chunks import parts
 
 WALK = np.column_stack((np.arange(1000.0), np.zeros((1000, 2))))
 """A kilometre on foot, a keyframe each metre."""

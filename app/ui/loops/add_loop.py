@@ -19,7 +19,7 @@ from app.ui.html import panel
 from app.ui.loops.edges import nearest
 from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.words import NEWER, OLDER
-from app.ui.nodes import add_exact_points
+from app.ui.nodes import add_exact_points, clear
 from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, poses_of, show
 
 _REST_S: Final = 0.4
@@ -89,7 +89,7 @@ class AddLoopPanel:
         gui = page.gui
         self._page, self._propose, self._fly = page, propose, fly
         self._overlay = Overlay(page.scene, f"{_NODE}/clouds")
-        self._dots: viser.PointCloudHandle | None = None
+        self._dots: list[viser.PointCloudHandle] = []  # one node of them, or none
         self._changes = Changes()  # of the dots
         self._picked: list[int] | None = None
         self._nudging: Nudging | None = None
@@ -201,14 +201,11 @@ class AddLoopPanel:
         self._pick.label = _PICK if picked is None else (_SECOND if picked else _FIRST)
         if not self._changes(snapshot.keyframe_poses, -1 if picked is None else len(picked)):
             return
-        if self._dots is not None:
-            self._dots.remove()
-            self._dots = None
+        clear(self._dots)
         positions = poses_of(snapshot)[:, :3, 3]
         if picked is None or not len(positions):
             return
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))
         colours[picked] = OLDER if len(picked) < 2 else NEWER
-        self._dots = add_exact_points(
-            self._page.scene, f"{_NODE}/keyframes", positions.astype(np.float32), colours, 0.15
-        )
+        name, exact = f"{_NODE}/keyframes", positions.astype(np.float32)
+        self._dots.append(add_exact_points(self._page.scene, name, exact, colours, 0.15))

@@ -94,7 +94,6 @@ class LoopEdges:
         return None if index is None else pairs[index]
 
     def _draw(self, style: str, lines: F32, colour: Rgb, width: float, knob_m: float, label: str = "") -> None:
-        """Send the nodes of a style, unless they are drawn so already."""
         text, painted, before = self._drawn.get(style, ("", colour, lines[:0]))
         if (
             (text, painted) == (label, colour)

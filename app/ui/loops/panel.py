@@ -221,7 +221,6 @@ class LoopsPanel:
             self._opener = event.client.gui.add_html(panel("open_tab", "Loops"))
 
     def _step(self, by: int) -> None:
-        """To the next loop in the table's order, or back."""
         rows = [edge.pair for edge in listed(self._snapshot().loops.edges, self._shown, self._order)]
         if rows:
             here = rows.index(self._chosen) if self._chosen in rows else (-1 if by > 0 else len(rows))

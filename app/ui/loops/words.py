@@ -195,7 +195,6 @@ def _cost_change(before: tuple[FactorResidual, ...], after: tuple[FactorResidual
 
 
 def _worst(residuals: tuple[FactorResidual, ...]) -> str:
-    """The factor with the largest residual."""
     return next((f"{number(f.sigmas, 1)} σ ({_what(f)})" for f in _largest_first(residuals)), "none")
 
 
