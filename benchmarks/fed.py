@@ -82,7 +82,7 @@ def _fed(recording: Path, params: Params, url: str, imu: str | None) -> Snapshot
 
 def _positions(snapshot: Snapshot) -> tuple[I64, F64]:
     """Ends of the scans (n,), ns, and positions of the IMU in the map at these times (n, 3), m."""
-    assert snapshot.trajectory is not None and snapshot.recording is not None
+    assert snapshot.recording is not None
     stamps = snapshot.recording.start_ns + np.round(snapshot.series["stamp_s"] * 1e9)
     known = np.isfinite(stamps)
     return stamps[known].astype(np.int64), np.array(snapshot.trajectory)[known]

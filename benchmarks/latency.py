@@ -69,7 +69,7 @@ def _to_poses(walk: Path) -> tuple[list[float], dict[int, F64]]:
             snapshot = engine.wait(engine.snapshot.revision, timeout=0.1)
             if snapshot.result is not None:
                 came.setdefault(snapshot.result.stamp_ns, time.monotonic())
-        assert snapshot.trajectory is not None and snapshot.recording is not None
+        assert snapshot.recording is not None
         stamps = snapshot.recording.start_ns + np.round(snapshot.series["stamp_s"] * 1e9).astype(np.int64)
         positions = dict(zip(stamps.tolist(), snapshot.trajectory, strict=True))
     return sending.delays(came), positions

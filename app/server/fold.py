@@ -55,7 +55,7 @@ class Fold:
         shown = min(now.transport.frame + 1, len(self._frames))
         keyframes = int(np.searchsorted(self._keyframes, shown))
         poses = before.keyframe_poses  # the same object tells the page that none has moved
-        if moved or poses is None or keyframes != len(poses):
+        if moved or keyframes != len(poses):
             poses = self._poses[:keyframes]
         T_map_truth, series = self._series(shown, now.recording)
         self.snapshot = replace(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
 from app.export.points import EVERYTHING, Choice
 from app.georeference.align import Alignment
@@ -289,6 +290,10 @@ class Earth:
     problem: str = ""
 
 
+_NO_POSES, _NO_POSITIONS = np.empty((0, 4, 4)), np.empty((0, 3))
+"""The same objects in all snapshots that have none, which tells the page that nothing has changed."""
+
+
 @dataclass(frozen=True, slots=True)
 class Snapshot(Kept):
     """All that the page draws, as one immutable value.
@@ -315,8 +320,8 @@ class Snapshot(Kept):
     transport: Transport = Transport()
     result: StepResult | None = None
     chunks: tuple[Chunk, ...] = ()
-    keyframe_poses: F64 | None = None
-    trajectory: F64 | None = None
+    keyframe_poses: F64 = field(default_factory=lambda: _NO_POSES)
+    trajectory: F64 = field(default_factory=lambda: _NO_POSITIONS)
     corrections: MapFrame = field(default_factory=MapFrame)
     loops: LoopsView = LoopsView()
     series: dict[str, F64] = field(default_factory=dict)

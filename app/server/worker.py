@@ -131,8 +131,8 @@ class EngineProcess:
         self._edit(notices=notices, progress=Progress("Starting the engine again", math.nan))
         on_the_way = last.progress is not None or last.transport.frame < 0  # to the frame of the process before
         setup = self._next_setup(play=self._started_with.play if on_the_way else last.transport.playing)
-        frames = 0 if last.trajectory is None else len(last.trajectory)
-        self._start(replace(setup, recording=place, revive=True, frames=frames, chunks=len(last.chunks)))
+        frames, chunks = len(last.trajectory), len(last.chunks)
+        self._start(replace(setup, recording=place, revive=True, frames=frames, chunks=chunks))
 
     def _next_setup(self, *, play: bool) -> Setup:
         """What the next process starts with: parameters and settings as they are now."""

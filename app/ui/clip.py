@@ -21,7 +21,7 @@ from app.ui.geometry import wxyz
 from app.ui.html import panel
 from app.ui.measure import MeasurePanel
 from app.ui.nodes import add_lines
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, notify_error, poses_of, show
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, notify_error, show
 
 _NODE: Final = f"{ROOT}/clip"
 _COLOUR: Final = (255, 205, 80)
@@ -151,7 +151,7 @@ class ClipPanel:
         """Show the profile and look at all of it, or at the whole map again."""
         trajectory, points = self._page.snapshot().trajectory, self._around()
         try:
-            path = strides(trajectory[:, :2] if trajectory is not None else np.empty((0, 2)))
+            path = strides(trajectory[:, :2])
         except HemislamError:
             show(self._unrolled, False)
             raise
@@ -173,7 +173,7 @@ class ClipPanel:
             self._measure.pick(self._picked)
             self._first = spot
             return
-        poses = poses_of(current)
+        poses = current.keyframe_poses
         first, second = (lie.moved(poses[one.keyframe], one.at) for one in (self._first, spot))
         self._first = None
         whole = self._whole()

@@ -187,7 +187,7 @@ class ComparePanel:
     def _draw_scene(self, a: Snapshot, b: Snapshot | None, view: View) -> None:
         if b is None or not same_recording(a, b):
             b = None
-        positions: F64 = b.trajectory if b is not None and b.trajectory is not None else np.empty((0, 3))
+        positions = b.trajectory if b is not None else np.empty((0, 3))
         at = positions[-1] if len(positions) else None
         self._scene.draw_b(positions[max(self._forks.forked_at, 0) :], at, view.path)
         pair = self._matching(a, b) if b is not None else None

@@ -22,7 +22,7 @@ from app.ui.loops.words import describe_edit
 from app.ui.measure import MeasurePanel
 from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, poses_of, show
+from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, show
 
 NOTHING, RECORDED, FILE, CONTROL = "nothing", "fixes of the recording", "fixes of a file", "control points"
 _ALIGN, _FACTORS = "align only", "as factors"
@@ -164,7 +164,7 @@ class GeoreferencePanel:
     def _picked(self, spot: Spot, current: Snapshot) -> None:
         """A click met the map: the point itself, or the centre of the sphere there, is the chosen control point."""
         self._pick.label = "Pick it on the map"
-        poses, at, name = poses_of(current), spot.at, self._name.value
+        poses, at, name = current.keyframe_poses, spot.at, self._name.value
         try:
             if self._fit.value == _SPHERE:
                 at = centre_of_sphere(current.chunks, poses, spot, self._radius.value)

@@ -18,7 +18,7 @@ from app.ui.colours import DENSITY, DISTANCE, MODES, TABLES, Limits, value_colou
 from app.ui.files import FileList
 from app.ui.html import Tile, number, panel
 from app.ui.map_numbers import Density, MapNumbers
-from app.ui.widgets import Changes, Page, View, add_button, dialog, poses_of
+from app.ui.widgets import Changes, Page, View, add_button, dialog
 
 _BINS: Final = 41
 _LEAST_M: Final = 0.005
@@ -63,7 +63,7 @@ class MapComparePanel:
     def seen(self, current: Snapshot, view: View) -> View:
         """The view with the numbers that its colour mode needs."""
         if view.colour_by == DENSITY:
-            return replace(view, numbers=self._density.of(current.chunks, poses_of(current)))
+            return replace(view, numbers=self._density.of(current.chunks, current.keyframe_poses))
         return replace(view, numbers=self._distance) if view.colour_by == DISTANCE else view
 
     def draw(self, current: Snapshot) -> None:
@@ -98,7 +98,7 @@ class MapComparePanel:
         current = self._page.snapshot()
         if self._work.running or not current.chunks:
             return
-        poses, found = poses_of(current), current.earth.found
+        poses, found = current.keyframe_poses, current.earth.found
         scans = tuple(
             KeyframePoints(chunk.points, chunk.stamp_ns, poses[chunk.index], chunk.T_imu_lidar)
             for chunk in current.chunks

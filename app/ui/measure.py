@@ -17,7 +17,7 @@ from app.ui.html import panel
 from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, words
 from app.ui.nodes import add_exact_points, add_lines, clear, segments
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, dialog, poses_of
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, dialog
 
 POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick"
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
@@ -75,7 +75,7 @@ class MeasurePanel:
     def draw(self, current: Snapshot, view: View) -> None:
         """Take the newest click, and show what the session keeps."""
         click, self._click = self._click, None
-        poses = poses_of(current)
+        poses = current.keyframe_poses
         kind = self._kind
         if click is not None and kind != STOP and view.map:
             spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, moving=view.moving, clip=view.clip)

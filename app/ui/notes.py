@@ -80,9 +80,8 @@ class NotesPanel:
     # --- pins ------------------------------------------------------------------------------------
     def _draw_pins(self, snapshot: Snapshot, view: View) -> None:
         """Pin the newest notes of frames that the trajectory reaches."""
-        path = snapshot.trajectory if snapshot.trajectory is not None else np.empty((0, 3))
-        pinned = pins(snapshot.notes, len(path)) if view.notes else []
-        where = path[[frame for frame, _ in pinned]].reshape(-1, 3)
+        pinned = pins(snapshot.notes, len(snapshot.trajectory)) if view.notes else []
+        where = snapshot.trajectory[[frame for frame, _ in pinned]].reshape(-1, 3)
         if not self._changes(str(pinned), str(where.round(2).tolist())):
             return
         self._pinned, self._where = pinned, where

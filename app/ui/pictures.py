@@ -64,8 +64,7 @@ class PicturesPanel:
 
     def draw(self, snapshot: Snapshot) -> None:
         flying = self._flying is not None and self._flying.is_alive()
-        path = snapshot.trajectory
-        self._start.disabled = flying or path is None or len(path) < 2
+        self._start.disabled = flying or len(snapshot.trajectory) < 2
         if self._changes(flying, int(100 * self._share), str(self._saved)):
             self._progress.visible = self._stop.visible = flying
             self._progress.value = 100 * self._share  # type: ignore[misc]  # mypy overlooks viser's setter
@@ -129,7 +128,7 @@ class PicturesPanel:
     # --- a flight --------------------------------------------------------------------------------
     def _fly(self, client: viser.ClientHandle) -> None:
         path = self._page.snapshot().trajectory
-        if path is None or len(path) < 2 or (self._flying is not None and self._flying.is_alive()):
+        if len(path) < 2 or (self._flying is not None and self._flying.is_alive()):
             return
         self._size()
         stations = flight(path, round(_RATE * self._seconds.value), *_WAYS[self._way.value])

@@ -54,7 +54,7 @@ class ProfileNode:
         if not view.slab:
             clear(self._nodes)
             self._changes()
-        elif self._changes(current.chunks, current.keyframe_poses, view) and current.trajectory is not None:
+        elif self._changes(current.chunks, current.keyframe_poses, view):
             clear(self._nodes)
             with contextlib.suppress(HemislamError):  # nobody has walked yet
                 path = strides(current.trajectory[:, :2])

@@ -18,7 +18,7 @@ from app.ui.colours import chosen_ends
 from app.ui.nodes import TrajectoryNode, Truth
 from app.ui.profile import ProfileNode
 from app.ui.sensor import SensorScene
-from app.ui.widgets import ROOT, Changes, View, poses_of
+from app.ui.widgets import ROOT, Changes, View
 
 _FOLLOWED_M: Final = 1e-3
 _FOLLOW_RATE: Final = 0.3
@@ -90,11 +90,11 @@ class Scene:
         with self._server.atomic():
             self._draw_scan(current, view)
         with self._server.atomic():
-            poses = poses_of(current)
+            poses = current.keyframe_poses
             eyes = np.array(list(self.eyes)).reshape(-1, 3)
             self.chunks.draw(current.chunks[: len(poses)], poses, view, eyes)
             self._profile.draw(current, view)
-            self._trajectory.draw(current.trajectory if current.trajectory is not None else np.empty((0, 3)), view.path)
+            self._trajectory.draw(current.trajectory, view.path)
             recording = current.recording
             self._truth.draw(recording.truth_positions if recording else None, current.T_map_truth, view.path)
         return self._look(current, view) and self.chunks.limits is limits and self.chunks.settled

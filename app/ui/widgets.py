@@ -111,11 +111,6 @@ class Page:
             notify_error(client, error)
 
 
-def poses_of(snapshot: Snapshot) -> F64:
-    """(k, 4, 4) T_map_imu of the keyframes."""
-    return snapshot.keyframe_poses if snapshot.keyframe_poses is not None else np.empty((0, 4, 4))
-
-
 _PLAIN: Final = (str, int, float, Enum, frozenset, View, Limits)
 
 

@@ -59,8 +59,8 @@ def content(snapshot: Snapshot) -> dict[str, Any]:
         "transport": replace(snapshot.transport, frames_per_second=0.0),
         "recording": snapshot.recording and snapshot.recording.path,
         "labels": None if result is None else (result.index, result.cloud.labels.tobytes()),
-        "trajectory": None if snapshot.trajectory is None else snapshot.trajectory.tolist(),
-        "poses": None if snapshot.keyframe_poses is None else snapshot.keyframe_poses.tolist(),
+        "trajectory": snapshot.trajectory.tolist(),
+        "poses": snapshot.keyframe_poses.tolist(),
         "chunks": [(chunk.index, chunk.points.tobytes(), chunk.labels.tobytes()) for chunk in snapshot.chunks],
         "series": {name: np.nan_to_num(column, nan=-1).tolist() for name, column in snapshot.series.items()},
         "progress": repr(snapshot.progress),
@@ -132,7 +132,6 @@ def test_a_loop_closure_sends_corrections_and_no_frame() -> None:
     delta = frames.page.take()
     assert (delta.keep, delta.frames, delta.chunks) == (10, (), ())
     after = frames.fold.apply(delta)
-    assert before.trajectory is not None and after.trajectory is not None and after.keyframe_poses is not None
     np.testing.assert_allclose(after.trajectory[:, 2], np.arange(10.0), atol=1e-12)
     np.testing.assert_allclose(after.keyframe_poses[:, 2, 3], np.arange(10.0), atol=1e-12)
     assert not before.trajectory[:, 2].any(), "what was shown before stays as it was"
@@ -153,7 +152,6 @@ def test_frames_lie_where_the_newest_corrections_put_them_whatever_came_before(
         T_map_odom = np.tile(np.eye(4), (count, 1, 1))
         T_map_odom[:, 2, 3] = ups[:count]
         seen = frames.see(corrections=MapFrame(np.arange(count), T_map_odom))
-        assert seen.trajectory is not None
         np.testing.assert_allclose(seen.trajectory[:, 0], np.arange(count), atol=1e-12)
         np.testing.assert_allclose(seen.trajectory[:, 2], ups[:count], atol=1e-12)
 

@@ -252,7 +252,7 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
 
 def same(a: Snapshot, b: Snapshot) -> None:
     """To the last bit, but for how long it took."""
-    assert a.trajectory is not None and b.trajectory is not None and a.result is not None and b.result is not None
+    assert a.result is not None and b.result is not None
     np.testing.assert_array_equal(a.trajectory, b.trajectory)
     for name in SERIES:
         if not name.endswith("_ms"):
@@ -286,7 +286,6 @@ def test_a_fork_with_the_same_parameters_is_the_same_and_with_others_what_a_fres
         positions.append(result.T_map_imu[:3, 3])
         turns.append(result.state.R_odom_imu)
     session.close()
-    assert b.trajectory is not None and a.trajectory is not None
     np.testing.assert_array_equal(b.trajectory, positions)
     assert np.abs(a.trajectory - b.trajectory)[21:].max() > 1e-6, "the parameters were meant to change something"
     np.testing.assert_array_equal(a.trajectory[:21], b.trajectory[:21])
@@ -307,7 +306,7 @@ def test_a_killed_b_leaves_a_going_and_comes_back(real: Workspace) -> None:
     assert a.session == before.session and len(a.notices) == len(before.notices)
     _, again = both_at(real, frame)
     assert any("restarted" in notice.text for notice in again.notices)
-    assert again.params == b.params and again.trajectory is not None and b.trajectory is not None
+    assert again.params == b.params
     np.testing.assert_array_equal(again.trajectory[: len(b.trajectory)], b.trajectory)
 
 

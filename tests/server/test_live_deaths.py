@@ -55,7 +55,7 @@ def test_whoever_dies_the_walk_goes_on_in_the_same_map(params: Params, tmp_path:
     assert end.session == before.session, "the page keeps its map"
     assert end.engine_alive and not end.transport.finished
     assert [chunk.index for chunk in end.chunks] == list(range(len(end.chunks)))
-    assert end.trajectory is not None and len(end.trajectory) == end.transport.frame + 1
+    assert len(end.trajectory) == end.transport.frame + 1
     assert (np.diff(end.series["stamp_s"]) > 0.05).all(), "no scan twice, and none before another"
     told = [notice.text for notice in end.notices]
     assert sum("was started again; nothing was received for" in text for text in told) == 2

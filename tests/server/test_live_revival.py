@@ -66,7 +66,7 @@ class Bench:
         self.publisher = Publisher(
             self._params,
             session=page.session,
-            frames=0 if page.trajectory is None else len(page.trajectory),
+            frames=len(page.trajectory),
             chunks=len(page.chunks),
         )
 
@@ -156,7 +156,6 @@ def test_however_often_engines_die_every_scan_is_mapped_once_or_counted_as_dropp
     assert bench.session is not None and bench.session.log.dropped == {BUSY: page.transport.dropped}
     mapped = [event.scan.end_ns for event in events if isinstance(event, Measurement)]
     assert bench.session.log.stamps_ns.tolist() == mapped
-    assert page.trajectory is not None and undisturbed.trajectory is not None
     np.testing.assert_allclose(page.trajectory, undisturbed.trajectory, rtol=0, atol=1e-9)
     for name in ("stamp_s", "dropped", "used", "distance"):
         np.testing.assert_allclose(page.series[name], undisturbed.series[name], err_msg=name)

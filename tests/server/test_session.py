@@ -100,7 +100,6 @@ def test_seeking_back_takes_from_the_scene_what_came_later() -> None:
     there = bench.fold.snapshot
     snapshot = bench.do(Seek(12))
     assert snapshot.transport.frame == 12 and snapshot.session == 1
-    assert snapshot.trajectory is not None and there.trajectory is not None
     assert np.array_equal(snapshot.trajectory, there.trajectory[:13])
     assert [chunk.index for chunk in snapshot.chunks] == [0, 1, 2]
     assert len(bench.sessions) == 1, "the recording stays open"
@@ -149,7 +148,6 @@ def test_a_restart_keeps_the_notes() -> None:
 
 def test_everything_the_page_draws_arrives() -> None:
     snapshot = Bench().do(Seek(20))
-    assert snapshot.trajectory is not None and snapshot.keyframe_poses is not None
     expected = np.array([fakes.pose(index)[:3, 3] for index in range(21)])
     np.testing.assert_allclose(snapshot.trajectory, expected)
     np.testing.assert_allclose(snapshot.keyframe_poses, [fakes.pose(index) for index in (0, 5, 10, 15, 20)])

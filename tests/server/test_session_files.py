@@ -43,7 +43,7 @@ def test_opening_another_recording_empties_the_scene_and_pauses() -> None:
     snapshot = bench.do(OpenRecording(Path("walk-30.mcap")))
     assert snapshot.recording is not None and snapshot.recording.path == Path("walk-30.mcap")
     assert snapshot.transport.frame == 0 and not snapshot.transport.playing
-    assert snapshot.trajectory is not None and len(snapshot.trajectory) == 1 and len(snapshot.chunks) == 1
+    assert len(snapshot.trajectory) == 1 and len(snapshot.chunks) == 1
 
 
 def test_a_file_that_can_not_be_opened_leaves_the_session_as_it_is() -> None:
@@ -83,7 +83,7 @@ def test_a_recording_damaged_in_the_middle_keeps_what_was_read() -> None:
     snapshot = Bench("broken-60-20.mcap").do(SetSpeed(math.inf), Play())
     assert "damaged at frame 20" in last_notice(snapshot)
     assert snapshot.transport.frame == 19 and not snapshot.transport.playing and snapshot.transport.finished
-    assert snapshot.trajectory is not None and len(snapshot.trajectory) == 20
+    assert len(snapshot.trajectory) == 20
 
 
 def test_an_engine_that_fails_on_a_frame_pauses_and_can_go_on() -> None:

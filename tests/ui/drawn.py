@@ -28,7 +28,7 @@ class Drawn:
         if self.budget is not None:
             known = self.snapshot.chunks if self.snapshot else ()
             chunks, result = known + snapshot.chunks[len(known) :], snapshot.result
-            assert snapshot.keyframe_poses is not None and result is not None
+            assert result is not None
             chunks = within_budget(chunks, snapshot.keyframe_poses, result.T_map_imu[:3, 3], self.budget)
             snapshot = replace(snapshot, chunks=chunks)
         self.scene.draw(snapshot, view)

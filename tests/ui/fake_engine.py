@@ -250,8 +250,8 @@ class FakeEngine:
             transport=Transport(speed=self._snapshot.transport.speed),
             result=None,
             chunks=(),
-            keyframe_poses=None,
-            trajectory=None,
+            keyframe_poses=np.empty((0, 4, 4)),
+            trajectory=np.empty((0, 3)),
             series={},
             T_map_truth=None,
         )
@@ -261,7 +261,6 @@ class FakeEngine:
         snapshot = self._snapshot
         if not 0 <= frame < snapshot.transport.frame:
             return
-        assert snapshot.trajectory is not None and snapshot.keyframe_poses is not None
         result, chunks = self.result(frame, snapshot.params), frame // 6 + 1
         del self._rows[frame + 1 :]
         self.publish(
@@ -307,9 +306,9 @@ class FakeEngine:
                 ),
             )
             new = T_map_lidar[None]
-            poses = new if poses is None else np.concatenate((poses, new))
+            poses = np.concatenate((poses, new))
         position = T_map_lidar[None, :3, 3]
-        trajectory = position if snapshot.trajectory is None else np.concatenate((snapshot.trajectory, position))
+        trajectory = np.concatenate((snapshot.trajectory, position))
         error = 0.004 + 0.0001 * frame if self._truth else np.nan
         row = {
             "stamp_s": 0.1 * frame,

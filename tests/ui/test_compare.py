@@ -263,7 +263,6 @@ def test_swapped_b_is_drawn_whole_and_a_follows(page: Page) -> None:
     page.draw()
     assert "A · wide" in page.panel._status.content and "B · main" in page.panel._status.content
     (path,) = page.workbench._scene._trajectory._drawn
-    assert page.forks.snapshot.trajectory is not None
     np.testing.assert_allclose(path, page.forks.snapshot.trajectory, rtol=0, atol=1e-3)
     page.forks.send(StepFrame(1))
     eventually(lambda: page.engine.snapshot.transport.frame == 41)

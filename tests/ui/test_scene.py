@@ -66,7 +66,7 @@ def test_while_the_ground_is_tuned_the_map_is_dimmed_and_the_scan_shows_its_labe
 
 
 def test_keyframes_that_a_loop_moves_send_poses_and_no_points(drawn: Drawn, wire: Wire) -> None:
-    moved = drawn.engine.snapshot.keyframe_poses.copy()  # type: ignore[union-attr]
+    moved = drawn.engine.snapshot.keyframe_poses.copy()
     moved[:, 0, 3] += 0.5
     drawn.draw(keyframe_poses=moved)
     assert wire.nodes("PointCloudMessage") == []
@@ -88,7 +88,7 @@ def test_points_are_drawn_where_the_map_has_them(drawn: Drawn, server: viser.Vis
 
     drawn.draw(View(ceilings=True))
     snapshot = drawn.engine.snapshot
-    for chunk, T in zip(snapshot.chunks, snapshot.keyframe_poses, strict=True):  # type: ignore[arg-type]
+    for chunk, T in zip(snapshot.chunks, snapshot.keyframe_poses, strict=True):
         node = chunk_nodes(server)[f"/map/keyframes/{chunk.index}"]
         placed = SE3.from_rotation_and_translation(
             SO3(np.array(node.wxyz)), np.array(node.position)
@@ -98,7 +98,7 @@ def test_points_are_drawn_where_the_map_has_them(drawn: Drawn, server: viser.Vis
 
 def test_without_ceilings_the_map_has_no_points_above_the_walls(drawn: Drawn, server: viser.ViserServer) -> None:
     node = chunk_nodes(server)["/map/keyframes/0"]
-    up = drawn.engine.snapshot.keyframe_poses[0, 2, :3]  # type: ignore[index, union-attr]
+    up = drawn.engine.snapshot.keyframe_poses[0, 2, :3]
     assert (node.points.astype(float) @ up).max() < 1.3
     drawn.draw(View(ceilings=True))
     node = chunk_nodes(server)["/map/keyframes/0"]
@@ -183,7 +183,7 @@ def test_colouring_sends_colours_only_and_the_legend_knows_its_limits(drawn: Dra
 def test_higher_points_are_lighter_when_coloured_by_height(drawn: Drawn, server: viser.ViserServer) -> None:
     drawn.draw(View(colour_by="height"))
     node = chunk_nodes(server)["/map/keyframes/0"]
-    height = node.points.astype(float) @ drawn.engine.snapshot.keyframe_poses[0, 2, :3]  # type: ignore[index, union-attr]
+    height = node.points.astype(float) @ drawn.engine.snapshot.keyframe_poses[0, 2, :3]
     order = np.argsort(height)
     third = len(order) // 3
     assert node.colors[order[-third:]].mean() > node.colors[order[:third]].mean() + 20
@@ -196,7 +196,7 @@ def test_colours_spread_over_the_chosen_ends_and_saturate_beyond(drawn: Drawn, s
     low, high = all_values.low, all_values.low + 0.4 * (all_values.high - all_values.low)
     drawn.draw(View(colour_by="height", ends=Limits(low, high)))
     node = chunk_nodes(server)["/map/keyframes/0"]
-    pose = drawn.engine.snapshot.keyframe_poses[0]  # type: ignore[index]
+    pose = drawn.engine.snapshot.keyframe_poses[0]
     chunk = drawn.engine.snapshot.chunks[0]
     height = (node.points.astype(float) @ (pose @ chunk.T_imu_lidar)[2, :3]) + (pose @ chunk.T_imu_lidar)[2, 3]
     beyond = node.colors[height > high + 0.05].astype(int)

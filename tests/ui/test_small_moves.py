@@ -49,7 +49,6 @@ def test_a_drifting_map_is_sent_by_the_millimetre(
 
 
 def test_a_turn_that_is_visible_far_away_is_sent(drawn: Drawn, wire: Wire, engine: FakeEngine) -> None:
-    assert engine.snapshot.keyframe_poses is not None
     for angle, told in ((3e-5, False), (2e-4, True)):
         turned = engine.snapshot.keyframe_poses.copy()
         turned[0, :3, :3] = lie.exp(np.array([0.0, 0.0, angle])) @ turned[0, :3, :3]
@@ -62,7 +61,6 @@ def test_heights_that_change_little_by_little_are_coloured_again(
     drawn: Drawn, server: viser.ViserServer, wire: Wire, engine: FakeEngine
 ) -> None:
     """Also where the clouds are moved for another axis each time, before they have risen by a millimetre."""
-    assert engine.snapshot.keyframe_poses is not None
     wire.clear()
     for step in range(1, 41):
         risen = engine.snapshot.keyframe_poses.copy()

@@ -170,7 +170,7 @@ def test_the_thread_outlives_a_snapshot_that_can_not_be_drawn(page: Page, caplog
     page.workbench.start()
     page.engine.publish(trajectory=np.zeros((3, 7)))
     time.sleep(0.2)
-    page.engine.publish(trajectory=None, progress=Progress("Still here", 0.5))
+    page.engine.publish(trajectory=np.empty((0, 3)), progress=Progress("Still here", 0.5))
     deadline = time.monotonic() + 10
     while "Still here" not in page.workbench._transport._state.content and time.monotonic() < deadline:
         time.sleep(0.02)

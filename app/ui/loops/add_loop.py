@@ -20,7 +20,7 @@ from app.ui.loops.edges import nearest
 from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.words import NEWER, OLDER
 from app.ui.nodes import add_exact_points, clear
-from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, poses_of, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, show
 
 _REST_S: Final = 0.4
 """The guess is tried after the gizmo has rested this long."""
@@ -131,7 +131,7 @@ class AddLoopPanel:
 
     def suggest(self) -> None:
         older, newer = self.pair
-        count = len(poses_of(self._page.snapshot()))
+        count = len(self._page.snapshot().keyframe_poses)
         good = 0 <= older < newer < count
         self._problem.visible = not good
         if good:
@@ -141,7 +141,7 @@ class AddLoopPanel:
 
     def pick(self, origin: F64, direction: F64) -> None:
         """A click while picking; the ray is in the map."""
-        picked, positions = self._picked, poses_of(self._page.snapshot())[:, :3, 3]
+        picked, positions = self._picked, self._page.snapshot().keyframe_poses[:, :3, 3]
         index = nearest(positions[:, None], origin, direction, within=np.radians(3.0))
         if picked is None or index is None or index in picked:
             return
@@ -153,7 +153,7 @@ class AddLoopPanel:
     def draw_scene(self, snapshot: Snapshot, view: View) -> None:
         """Called by the drawing thread, often: dots to pick from, the two clouds, and the guess once it rests."""
         self._draw_picking(snapshot)
-        poses, pair, nudging = poses_of(snapshot), self.pair, self._nudging
+        poses, pair, nudging = snapshot.keyframe_poses, self.pair, self._nudging
         wanted = self._nudge.value and 0 <= pair[0] < pair[1] < len(poses)
         if nudging is not None and (not wanted or nudging.pair != pair):
             nudging.gizmo.remove()
@@ -189,7 +189,7 @@ class AddLoopPanel:
         return rows(nudging.T_older_newer) if nudging is not None and nudging.pair == self.pair else None
 
     def _look(self, nudging: bool, client: viser.ClientHandle) -> None:
-        poses, newer = poses_of(self._page.snapshot()), self.pair[1]
+        poses, newer = self._page.snapshot().keyframe_poses, self.pair[1]
         if nudging and newer < len(poses):
             self._fly(client, poses[newer][:3, 3], _FROM_M)
 
@@ -202,7 +202,7 @@ class AddLoopPanel:
         if not self._changes(snapshot.keyframe_poses, -1 if picked is None else len(picked)):
             return
         clear(self._dots)
-        positions = poses_of(snapshot)[:, :3, 3]
+        positions = snapshot.keyframe_poses[:, :3, 3]
         if picked is None or not len(positions):
             return
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))

@@ -15,7 +15,7 @@ from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.words import BRIDGE, describe_edit, forecast, kind_of, what_happened, what_was_undone
 from app.ui.nodes import add_lines, clear, segments
-from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, by_user, poses_of, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, by_user, show
 
 _REST_S: Final = 0.3
 _GHOST: Final[dict[bool, Rgb]] = {False: (255, 232, 70), True: (120, 90, 0)}
@@ -116,7 +116,7 @@ class Proposal:
         if command is None:
             return
         self.command, self.last, self._after = None, command, None
-        self._before = poses_of(self._snapshot())
+        self._before = self._snapshot().keyframe_poses
         self._send(EditLoop(command))
         self._applied(command)
 
@@ -128,7 +128,7 @@ class Proposal:
     def see(self, snapshot: Snapshot) -> None:
         """Note what the last edit did, once the snapshot has it, or that it was undone."""
         seen, self._seen = self._seen, snapshot
-        edits, now, before, poses = seen.loops.undo, snapshot.loops.undo, poses_of(seen), poses_of(snapshot)
+        edits, now, before, poses = seen.loops.undo, snapshot.loops.undo, seen.keyframe_poses, snapshot.keyframe_poses
         last = self.last
         if last is not None and self._after is None and now[-1:] == (last,):
             self._after = snapshot.loops.edges
@@ -151,7 +151,7 @@ class Proposal:
         self._undo.visible = self.last is not None
         if self._done.visible:
             self._happened.content = self.happened + panel("into_view")
-        command, loops, poses = self.command, snapshot.loops, poses_of(snapshot)
+        command, loops, poses = self.command, snapshot.loops, snapshot.keyframe_poses
         shown = command or looked_at
         asked = shown, loops.edges if shown is not None else None
         if asked[0] != self._asked[0] or asked[1] is not self._asked[1]:

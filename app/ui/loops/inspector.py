@@ -18,7 +18,7 @@ from app.ui.colours import TABLES
 from app.ui.html import heading, panel
 from app.ui.loops.words import NEWER, OLDER, evidence
 from app.ui.nodes import add_exact_points, place
-from app.ui.widgets import ROOT, Changes, Page, View, by_user, chart, poses_of, show
+from app.ui.widgets import ROOT, Changes, Page, View, by_user, chart, show
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
 UNSEEN: Final = (104, 108, 116)
@@ -196,7 +196,7 @@ class Inspector:
 
     def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
         """Place the submaps in the scene, as far between the two poses as the slider is."""
-        detail, poses = _detail(snapshot, chosen), poses_of(snapshot)
+        detail, poses = _detail(snapshot, chosen), snapshot.keyframe_poses
         if self._alone_before is not None and not self._alone.value:
             detail = None
         if detail is None or chosen is None or chosen[1] >= len(poses):

@@ -21,7 +21,7 @@ from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
 from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, forecast, kind_of, largest_factors, name
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, poses_of
+from app.ui.widgets import ROOT, Changes, Page, View, add_button
 
 _STEPS: Final = 14
 _STEP_S: Final = 0.03
@@ -133,7 +133,7 @@ class LoopsPanel:
                 self._add_loop.suggest_pair(pair)
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
-        poses = poses_of(snapshot)
+        poses = snapshot.keyframe_poses
         if snapshot.session != self._session:
             self._session, self._coming = snapshot.session, None
             self.choose(None)
@@ -236,7 +236,7 @@ class LoopsPanel:
             frame = frames.get(edge.decided_at, frames.get(edge.newer))
             if frame is not None:
                 self._send(Seek(frame))
-        elif what == FLY and edge.newer < len(poses := poses_of(snapshot)):
+        elif what == FLY and edge.newer < len(poses := snapshot.keyframe_poses):
             ends = poses[[edge.older, edge.newer], :3, 3]
             self._fly(client, ends.mean(axis=0), 7.0 + 1.2 * float(np.linalg.norm(ends[1] - ends[0])))
 

@@ -51,7 +51,7 @@ def test_however_many_loops_there_are_a_few_nodes_draw_them(page: Page, wire: Wi
 
 def test_loops_move_with_their_keyframes(page: Page) -> None:
     before = page.node("/map/loops/accepted-in").points.copy()
-    poses = page.engine.snapshot.keyframe_poses.copy()  # type: ignore[union-attr]
+    poses = page.engine.snapshot.keyframe_poses.copy()
     poses[:, 1, 3] += 2.0
     page.engine.publish(keyframe_poses=poses)
     page.draw()
