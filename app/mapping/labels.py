@@ -13,7 +13,7 @@ from app.mapping.moving import MovingPoints
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.ply import Keyframes
-from app.slam.types import MOVING, U8, Keyframe, Mask
+from app.slam.types import MOVING, U8, Keyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class LabelledKeyframes:
     """Keyframes with the labels of all layers.
 
     Args:
-        count: of keyframes, if no others are to be seen. moving: finds the points that move; None: nothing does.
+        count: of keyframes, if no others are to be seen. moving: finds the points that move.
 
     Attributes:
         edits: those in force, oldest first.
@@ -45,12 +45,12 @@ class LabelledKeyframes:
     def __init__(
         self,
         keyframes: Keyframes,
+        moving: MovingPoints,
         edits: tuple[LabelEdit, ...] = (),
-        moving: MovingPoints | None = None,
         count: int | None = None,
     ) -> None:
-        self._keyframes, self.edits, self._moving, self._count = keyframes, edits, moving, count
-        self._params = moving.params if moving is not None else None
+        self._keyframes, self._moving, self.edits, self._count = keyframes, moving, edits, count
+        self._params = moving.params
 
     def __len__(self) -> int:
         return len(self._keyframes) if self._count is None else self._count
@@ -62,34 +62,29 @@ class LabelledKeyframes:
         labels = next((edit.labels for edit in reversed(self.edits) if edit.keyframe == index), b"")
         if len(labels) == len(keyframe.cloud):  # else there are none, or the engine's version kept other points then
             return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.frombuffer(labels, np.uint8)))
-        moves = self._moves(keyframe)
+        if self._count is None:
+            moves = self._moving.known(keyframe.index)
+        else:
+            moves = self._moving.find(keyframe, self._count, self._params)
         if moves is None or not moves.any():
             return keyframe
         return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.where(moves, MOVING, keyframe.cloud.labels)))
-
-    def _moves(self, keyframe: Keyframe) -> Mask | None:
-        if self._moving is None:
-            return None
-        if self._count is None or self._params is None:
-            return self._moving.known(keyframe.index)
-        return self._moving.find(keyframe, self._count, self._params)
 
     def now(self) -> "LabelledKeyframes":
         """The present ones with their present labels, which do not change any more.
 
         Which points move is found when a keyframe is read, if it is not known by then.
         """
-        return LabelledKeyframes(self._keyframes, self.edits, self._moving, len(self))
+        return LabelledKeyframes(self._keyframes, self._moving, self.edits, len(self))
 
     def find_moving(self, *, last: bool) -> tuple[int, bool] | None:
         """As `MovingPoints.next`, for the keyframes that are there."""
-        return self._moving.next(len(self), last=last) if self._moving is not None else None
+        return self._moving.next(len(self), last=last)
 
     def forget_after(self, count: int) -> None:
         """All but the first `count` keyframes will be others."""
         self.edits = tuple(edit for edit in self.edits if edit.keyframe < count)
-        if self._moving is not None:
-            self._moving.forget_after(count)
+        self._moving.forget_after(count)
 
     def edit(self, keyframe: int, labels: U8 | Sequence[int] | int) -> None:
         """Change a keyframe's labels. Raises HemislamError: as `LabelEdit.of`, or there is no such keyframe."""

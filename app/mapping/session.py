@@ -86,7 +86,7 @@ class Session:
         self.ended = False
         self.frames: Log[Frame] = Log()
         self._moving = MovingPoints(engine.keyframes, engine.params.moving)
-        self.keyframes = LabelledKeyframes(engine.keyframes, moving=self._moving)
+        self.keyframes = LabelledKeyframes(engine.keyframes, self._moving)
         self.survey: Survey | None = None
         self.calibration = ""
         self.adjustment = _NO_LOOPS

@@ -336,6 +336,11 @@ class Snapshot(Kept):
     live: LiveState | None = None
     earth: Earth = Earth()
 
+    @property
+    def last_notice(self) -> int:
+        """The number of the newest notice, 0 if there is none."""
+        return self.notices[-1].number if self.notices else 0
+
 
 @dataclass(frozen=True, slots=True)
 class Delta:

@@ -123,7 +123,7 @@ class EngineProcess:
         place = last.session_file or (LIVE if last.live is not None else None)
         restarts = place is not None and self._restarts.allows()
         again, ended = "It is restarted and returns to where it was.", "Restart it to begin at the first frame."
-        notices = (Notice(_number(last) + 1, "error", f"{death} {again if restarts else ended}"),)
+        notices = (Notice(last.last_notice + 1, "error", f"{death} {again if restarts else ended}"),)
         if not restarts:
             transport = replace(last.transport, playing=False, frames_per_second=0.0)
             self._edit(engine_alive=False, progress=None, transport=transport, notices=notices)
@@ -144,7 +144,7 @@ class EngineProcess:
             speed=last.transport.speed,
             breakpoints=last.breakpoints,
             session=last.session,
-            notices=_number(last),
+            notices=last.last_notice,
             kept=Kept.of(last),
         )
 
@@ -152,8 +152,3 @@ class EngineProcess:
         with self._changed:
             self._fold.edit(**values)
             self._changed.notify_all()
-
-
-def _number(snapshot: Snapshot) -> int:
-    """The number of the newest notice, 0 if there is none."""
-    return snapshot.notices[-1].number if snapshot.notices else 0

@@ -69,7 +69,7 @@ class CalibrationPanel:
             self.close()
             self._of, self._values, self._tried = recording, {}, not self._unasked
             self._html.visible = self._apply.visible = self._plot.visible = False
-            self._heard = max((notice.number for notice in snapshot.notices), default=0)
+            self._heard = snapshot.last_notice
         self._button.disabled = self._work.running or recording is None or recording == LIVE
         if not self._tried and not self._button.disabled and (_is_unknown(snapshot) or self._is_in_doubt(snapshot)):
             self._begin(asked=False)

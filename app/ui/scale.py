@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 import viser
 
+from app.server.protocol import Snapshot
 from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.widgets import PANEL_PERIOD_S, Changes, Page
@@ -51,9 +52,9 @@ class ScaleBars:
         self._page = page
         self._bars: dict[int, tuple[viser.GuiHtmlHandle, Changes]] = {}
 
-    def draw(self) -> None:
+    def draw(self, current: Snapshot) -> None:
         """Called often; sends what differs, at most a few times a second."""
-        current, clients = self._page.snapshot(), self._page.server.get_clients()
+        clients = self._page.server.get_clients()
         found, needle = current.earth.found, not current.clip.unrolled
         north = np.array(found.reference.rotation)[1] if found is not None else None
         for gone in self._bars.keys() - clients.keys():

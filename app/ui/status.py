@@ -132,8 +132,7 @@ class DoctorPanel:
         after = settled(snapshot.params, option) if option in known else None
         if after is None:
             return
-        values = {leaf.path: after.value(leaf.path) for leaf in leaves()}
-        changed = {path: value for path, value in values.items() if value != snapshot.params.value(path)}
+        changed = snapshot.params.changed(after)
         self._page.send(SetParams(changed))
         if any(leaf.effect == "restart" for leaf in leaves() if leaf.path in changed):
             self._page.send(Restart())

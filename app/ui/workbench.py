@@ -92,7 +92,7 @@ class Workbench:
         page = Page(server, engine.send, lambda: engine.snapshot, now, lambda: self._scene.offset)
 
         prepare_page(gui)
-        self._header, self._scale = HeaderPanel(gui), ScaleBars(page)
+        self._header, scale = HeaderPanel(gui), ScaleBars(page)
         self._transport = TransportPanel(page, lambda low, high: self._appearance.choose_ends(low, high))
         self._timeline = TimelinePanel(page)
         legend = gui.add_html("")
@@ -150,12 +150,11 @@ class Workbench:
             self._notices = NoticePanel(server)
         with tabs.add_tab("Help", viser.Icon.HELP):
             gui.add_html(render("help.html"))
-        self._files = files
 
         self._panels = (
             self._transport, self._breakpoints, self._notices, self._header, self._recent, self._timeline,
-            self._readouts, self._doctor, self._calibration, self._live, self._files, self._camera,
-            self._tune, self._georeference, self._clip, self._map_compare, self._pictures,
+            self._readouts, self._doctor, self._calibration, self._live, files, self._camera,
+            self._tune, self._georeference, self._clip, self._map_compare, self._pictures, scale,
         )  # fmt: skip
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
@@ -202,7 +201,6 @@ class Workbench:
         self._notes.draw(current, view)
         for one in self._panels:
             one.draw(current)
-        self._scale.draw()
 
     def _lines(self, current: Snapshot, view: View) -> list[tuple[Rgb, str]]:
         """Colours and names of the lines in the scene, and of the submaps of a loop that is looked at."""

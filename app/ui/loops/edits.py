@@ -108,8 +108,7 @@ class Proposal:
         self._changes = Changes()
 
     def propose(self, command: LoopEdit) -> None:
-        notices = self._snapshot().notices
-        self._last_notice = notices[-1].number if notices else 0
+        self._last_notice = self._snapshot().last_notice
         self.command, self.last, self._before, self.happened = command, None, None, ""
 
     def apply(self, command: LoopEdit | None) -> None:

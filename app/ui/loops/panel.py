@@ -53,7 +53,6 @@ class LoopsPanel:
         gui = page.gui
         self._taken = taken
         self._page, self._look_freely = page, look_freely
-        self._send, self._snapshot = page.send, page.snapshot
         self._chosen: Pair | None = None
         self._coming: Pair | None = None
         self._opener: viser.GuiHtmlHandle | None = None  # what showed this tab last, in one browser
@@ -195,7 +194,7 @@ class LoopsPanel:
         asked = (edge.pair, edge.verdict, edge.T_older_newer.tobytes()) if edge is not None else ()
         if asked != self._asked:
             self._asked = asked
-            self._send(InspectLoop(edge.pair if edge is not None else None))
+            self._page.send(InspectLoop(edge.pair if edge is not None else None))
 
     def _act(self, word: str, _: viser.ClientHandle) -> None:
         match word.split(" ", 1):
@@ -204,7 +203,7 @@ class LoopsPanel:
             case ["sort", column] if column in COLUMNS:
                 self._order = self._order.clicked(column)
             case ["choose", text]:
-                named = {f"{edge.older} {edge.newer}": edge.pair for edge in self._snapshot().loops.edges}
+                named = {f"{edge.older} {edge.newer}": edge.pair for edge in self._page.snapshot().loops.edges}
                 if text in named:
                     self.choose(None if named[text] == self._chosen else named[text])
 
@@ -221,13 +220,13 @@ class LoopsPanel:
             self._opener = event.client.gui.add_html(panel("open_tab", "Loops"))
 
     def _step(self, by: int) -> None:
-        rows = [edge.pair for edge in listed(self._snapshot().loops.edges, self._shown, self._order)]
+        rows = [edge.pair for edge in listed(self._page.snapshot().loops.edges, self._shown, self._order)]
         if rows:
             here = rows.index(self._chosen) if self._chosen in rows else (-1 if by > 0 else len(rows))
             self.choose(rows[min(max(here + by, 0), len(rows) - 1)])
 
     def _go(self, what: str, client: viser.ClientHandle) -> None:
-        snapshot, pair = self._snapshot(), self._chosen
+        snapshot, pair = self._page.snapshot(), self._chosen
         edge = next((edge for edge in snapshot.loops.edges if edge.pair == pair), None)
         if what == CLOSE or edge is None:
             self.choose(None)
@@ -235,7 +234,7 @@ class LoopsPanel:
             frames = {chunk.index: chunk.frame for chunk in snapshot.chunks}
             frame = frames.get(edge.decided_at, frames.get(edge.newer))
             if frame is not None:
-                self._send(Seek(frame))
+                self._page.send(Seek(frame))
         elif what == FLY and edge.newer < len(poses := snapshot.keyframe_poses):
             ends = poses[[edge.older, edge.newer], :3, 3]
             self._fly(client, ends.mean(axis=0), 7.0 + 1.2 * float(np.linalg.norm(ends[1] - ends[0])))
