@@ -31,7 +31,7 @@ def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes, c
         raise HemislamError(f"{name} is in {there.parent} already; open it there, or rename the one that you drop.")
     if offset + len(piece) > size:
         raise HemislamError(f"{name} has grown while it was copied; drop it again when it is complete.")
-    part = _part(there, copy)
+    part = there.with_name(f".{name}.{copy}.part")  # names that begin with a dot are not listed
     try:
         if offset == 0:
             if shutil.disk_usage(there.parent).free < size + _LEFT_FREE:
@@ -62,8 +62,3 @@ def _place(folders: Folders, name: str) -> Path:
     if not folders.roots:
         raise HemislamError("There is no folder to copy to; start hemislam with --folder.")
     return folders.roots[0] / name
-
-
-def _part(there: Path, copy: str) -> Path:
-    """Where a file is until it is complete; names that begin with a dot are not listed."""
-    return there.with_name(f".{there.name}.{copy}.part")

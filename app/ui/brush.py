@@ -78,7 +78,10 @@ class BrushPanel:
         self._rest.visible = self._radius.visible = self.painting
         self._save.visible = self._list.visible = bool(found)
         self._why.content = panel("quiet", self._words(snapshot, bool(found)))
-        rows = [(stamp, self._second(snapshot, stamp), *map(int, _counts(labels))) for stamp, labels in found.items()]
+        start_ns, rows = snapshot.recording.start_ns if snapshot.recording else None, []
+        for stamp, labels in found.items():
+            when = f"{(stamp - start_ns) * 1e-9:.1f} s" if start_ns is not None else ""
+            rows.append((stamp, when, *(int(np.count_nonzero(labels == mark)) for mark in (GROUND, NON_GROUND))))
         self._list.content = self._bridge.live(panel("labelled", rows)) if rows else ""
         self._draw_scene(result, found.get(result.stamp_ns) if result is not None else None, view.point_size)
 
@@ -137,10 +140,6 @@ class BrushPanel:
                 self._page.send(Paint(Stroke.of(result.stamp_ns, touched, mark)))
 
     # --- the frames that have marks --------------------------------------------------------------
-    @staticmethod
-    def _second(snapshot: Snapshot, stamp_ns: int) -> str:
-        return f"{(stamp_ns - snapshot.recording.start_ns) * 1e-9:.1f} s" if snapshot.recording else ""
-
     def _go(self, word: str, _: viser.ClientHandle) -> None:
         """What the list sends: "frame 1700000000000000000", a stamp."""
         snapshot = self._page.snapshot()
@@ -158,7 +157,3 @@ class BrushPanel:
     def _read(self, file: Any, _: viser.ClientHandle) -> None:
         for stroke in read_json(file.content.decode("utf-8", errors="replace"), Path(file.name).name):
             self._page.send(Paint(stroke))
-
-
-def _counts(labels: U8) -> tuple[int, int]:
-    return int(np.count_nonzero(labels == GROUND)), int(np.count_nonzero(labels == NON_GROUND))

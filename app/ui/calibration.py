@@ -71,7 +71,8 @@ class CalibrationPanel:
             self._html.visible = self._apply.visible = self._plot.visible = False
             self._heard = snapshot.last_notice
         self._button.disabled = self._work.running or recording is None or recording == LIVE
-        if not self._tried and not self._button.disabled and (_is_unknown(snapshot) or self._is_in_doubt(snapshot)):
+        doubted = any(one.number > self._heard and one.text.startswith(IN_DOUBT) for one in snapshot.notices)
+        if not self._tried and not self._button.disabled and (_is_unknown(snapshot) or doubted):
             self._begin(asked=False)
         if self._work.running and not self._asked and _is_unknown(snapshot):
             self._announce()
@@ -107,9 +108,6 @@ class CalibrationPanel:
             self._use()
         else:
             self._page.send(Calibrated(f"{contradiction}. To apply it, see Calibration under Recording."))
-
-    def _is_in_doubt(self, snapshot: Snapshot) -> bool:
-        return any(one.number > self._heard and one.text.startswith(IN_DOUBT) for one in snapshot.notices)
 
     def _announce(self) -> None:
         for number, client in self._page.server.get_clients().items():

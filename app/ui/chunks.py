@@ -216,17 +216,9 @@ class MapChunks:
         return np.concatenate([np.empty((0, 3)), *(lie.moved(T, points) for T, points in some)])
 
     def _cloud(self, chunk: Chunk, T_map_imu: F64, shown: npt.NDArray[np.bool_], light: F32 | None = None) -> PointSet:
-        return PointSet(
-            chunk.points[shown],
-            chunk.labels[shown],
-            chunk.intensity[shown],
-            chunk.ring[shown],
-            T_map_imu @ chunk.T_imu_lidar,
-            (chunk.stamp_ns - self._start_ns) * 1e-9,
-            light,
-            chunk.index,
-            self._view.numbers.of(chunk)[shown] if self._view.numbers is not None else None,
-        )
+        numbers = self._view.numbers.of(chunk)[shown] if self._view.numbers is not None else None
+        T, seconds = T_map_imu @ chunk.T_imu_lidar, (chunk.stamp_ns - self._start_ns) * 1e-9
+        return PointSet.of(chunk, shown, T, seconds, light, chunk.index, numbers)
 
     def _shown(self, drawn: _Drawn, T_map_imu: F64) -> PointSet:
         return self._cloud(drawn.chunk, T_map_imu, drawn.shown, drawn.light[drawn.shown])

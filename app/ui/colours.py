@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import F32, F64, GROUND, MOVING, NON_GROUND, SEED, U8, U16
+from app.server.protocol import Chunk
+from app.slam.types import F32, F64, GROUND, I64, MOVING, NON_GROUND, SEED, U8, U16, Cloud, Mask
 from app.ui.html import panel
 
 Rgb = tuple[int, int, int]
@@ -80,6 +81,12 @@ class PointSet:
     light: F32 | None = None
     keyframe: int = -1
     numbers: F32 | None = None
+
+    @classmethod
+    def of(cls, cloud: Cloud | Chunk, shown: I64 | Mask, T_map_lidar: F64, seconds: float, *more: Any) -> "PointSet":
+        """Some points of a cloud. more: the other attributes."""
+        points, labels, intensity, ring = cloud.points, cloud.labels, cloud.intensity, cloud.ring
+        return cls(points[shown], labels[shown], intensity[shown], ring[shown], T_map_lidar, seconds, *more)
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,17 +61,12 @@ def verdict(state: LiveState) -> tuple[str, str]:
     return "receiving", GOOD
 
 
-def age_colour(age_s: float | None) -> str:
-    if age_s is None:
-        return QUIET
-    return BAD if age_s > SILENT_S else WARN if age_s > OLD_S else GOOD
-
-
 def _tiles(state: LiveState) -> Iterator[Tile]:
     counted = state.counters
     for name, rate, age in (("LiDAR", state.lidar_hz, state.lidar_age_s), ("IMU", state.imu_hz, state.imu_age_s)):
         last = "nothing came yet" if age is None else f"last {_age(age)} ago"
-        yield Tile(name, number(rate, 1), "Hz", last, age_colour(age), "half")
+        colour = QUIET if age is None else BAD if age > SILENT_S else WARN if age > OLD_S else GOOD
+        yield Tile(name, number(rate, 1), "Hz", last, colour, "half")
     lost, of = counted.lost, counted.packets + counted.lost
     share = lost / of if of else 0.0
     note = f"{100 * share:.2f} % of {of:,}" if of else "no packets"

@@ -79,14 +79,7 @@ class SensorScene:
         another = previous is None or previous.index != result.index or previous.stamp_ns != result.stamp_ns
         cut, self._clip = view.clip != self._clip, view.clip
         if len(shown):  # the page cannot draw a cloud without points: it is hidden instead
-            points = PointSet(
-                cloud.points[shown],
-                cloud.labels[shown],
-                cloud.intensity[shown],
-                cloud.ring[shown],
-                T_map_lidar,
-                (result.stamp_ns - start_ns) * 1e-9,
-            )
+            points = PointSet.of(cloud, shown, T_map_lidar, (result.stamp_ns - start_ns) * 1e-9)
             by = LABEL if view.tuning or view.colour_by == LOOK else view.colour_by  # what is tuned stands out
             self._scan.colors = colours(points, by, limits)
             if another or cut or view.clip is not None:
