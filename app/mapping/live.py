@@ -136,23 +136,17 @@ def open_live_session(
     Raises:
         HemislamError: the receiving process has ended.
     """
-
-    def begin() -> tuple[LiveSession, LiveFeed]:
-        feed = LiveFeed(LiveClient(address), name)
-        return LiveSession(feed, params, folder), feed
-
-    def clear() -> None:
-        for file in (KEYFRAMES, HANDOVER, f"{HANDOVER}-journal"):
-            (folder / file).unlink(missing_ok=True)
-
-    if not take_over:
-        clear()
-    session, feed = begin()
-    if take_over and not session.take_over():
+    if take_over:
+        session = LiveSession(LiveFeed(LiveClient(address), name), params, folder)
+        if session.take_over():
+            return session
         session.close()
-        clear()
-        session, feed = begin()
+    for file in (KEYFRAMES, HANDOVER, f"{HANDOVER}-journal"):
+        (folder / file).unlink(missing_ok=True)
+    feed = LiveFeed(LiveClient(address), name)
+    session = LiveSession(feed, params, folder)
+    if take_over:
         feed.go_to((0, 0))  # all that was given to the process that died before its first checkpoint
-    elif not take_over:
+    else:
         feed.acknowledge()  # scans of an earlier session
     return session

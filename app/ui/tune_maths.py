@@ -11,7 +11,7 @@ from app.tuning.objectives import Objective
 from app.tuning.process import Tried
 from app.tuning.trial import Trial
 from app.ui.colours import TABLES
-from app.ui.html import css, panel
+from app.ui.html import panel
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, 334.0, 8.0, 108.0
 """Of a scatter plot, in units of its picture."""
@@ -130,26 +130,10 @@ def parallel(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
         good = shares[len(paths)] if objectives[0].greatest else 1 - shares[len(paths)]
         colour = TABLES["viridis"][round(255 * good)]
         points = " ".join(f"{x:.0f},{bottom - (bottom - top) * y:.1f}" for x, y in zip(across, shares, strict=True))
-        lines.append(
-            {
-                "number": trial.number,
-                "points": points,
-                "colour": css((int(colour[0]), int(colour[1]), int(colour[2]))),
-                "words": words(trial, objectives),
-                "chosen": trial.number == chosen,
-            }
-        )
+        lines.append((trial.number, points, colour.tolist(), words(trial, objectives), trial.number == chosen))
     ends = {0: "start", len(axes) - 1: "end"}
-    drawn = [
-        {
-            "x": round(float(x), 1),
-            "name": axis.name,
-            "low": axis.low,
-            "high": axis.high,
-            "anchor": ends.get(place, "middle"),
-        }
-        for place, (x, axis) in enumerate(zip(across, axes, strict=True))
-    ]
+    places = enumerate(zip(across, axes, strict=True))
+    drawn = [(round(float(x), 1), axis, ends.get(place, "middle")) for place, (x, axis) in places]
     return panel("tune.parallel", drawn, lines)
 
 
@@ -188,14 +172,7 @@ def _best(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
         if held:
             again = held.get(trial.number, (None,) * len(objectives))
             scores += ["" if value is None else one.text(value) for one, value in zip(objectives, again, strict=True)]
-        rows.append(
-            {
-                "number": trial.number,
-                "cells": scores,
-                "words": words(trial, objectives),
-                "chosen": trial.number == chosen,
-            }
-        )
+        rows.append((trial.number, scores, words(trial, objectives), trial.number == chosen))
     picked = next((trial for trial in shown if trial.number == chosen), None)
     return panel("tune.best", heads, rows, words(picked, objectives) if picked else "")
 
