@@ -42,6 +42,9 @@ class LoopsPanel:
     Args:
         look_freely: stops following the sensor, so that a camera can stay where it is put.
         taken: whether clicks in the scene are meant for something else.
+
+    Attributes:
+        chosen: the loop that is looked at.
     """
 
     def __init__(
@@ -53,7 +56,7 @@ class LoopsPanel:
         gui = page.gui
         self._taken = taken
         self._page, self._look_freely = page, look_freely
-        self._chosen: Pair | None = None
+        self.chosen: Pair | None = None
         self._coming: Pair | None = None
         self._opener: viser.GuiHtmlHandle | None = None  # what showed this tab last, in one browser
         self._session = -1
@@ -96,10 +99,6 @@ class LoopsPanel:
         gui.add_command("Previous loop of the table", hotkey="K").on_trigger(lambda _: self._step(-1))
         page.scene.on_click()(self._clicked)
 
-    @property
-    def chosen(self) -> Pair | None:
-        return self._chosen
-
     def seen(self, view: View) -> View:
         """The view, without the map and the scan while two submaps are shown alone."""
         alone = self._inspector.alone or self._add_loop.nudging
@@ -110,7 +109,7 @@ class LoopsPanel:
         found = {kind_of(edge).name for edge in snapshot.loops.edges}
         arches = [(kind.colour, f"{key} loop") for key, kind in KINDS.items() if key in found & self._shown]
         arches += self._proposal.ghost.key
-        if (chosen := self._chosen) is None:
+        if (chosen := self.chosen) is None:
             return arches
         arches = [(CHOSEN[light], f"chosen loop {name(chosen)}"), *arches]
         if not self._inspector.shown:
@@ -123,8 +122,8 @@ class LoopsPanel:
 
     def choose(self, pair: Pair | None) -> None:
         """Show everything about a loop; None: about none."""
-        if pair != self._chosen:
-            self._chosen = pair
+        if pair != self.chosen:
+            self.chosen = pair
             self._inspector.hide_map()
             if not self._add_loop.nudging:
                 self._proposal.cancel()
@@ -148,16 +147,16 @@ class LoopsPanel:
         other = None
         if edge is not None and not undo:
             other = (Reject if edge.verdict is Verdict.ACCEPTED else Accept)(*edge.pair)
-        self._proposal.draw(snapshot, other, self._chosen, view.light)
+        self._proposal.draw(snapshot, other, self.chosen, view.light)
         words = ""
         if edge is not None and self._proposal.happened and self._proposal.about == edge.pair:
             words = self._proposal.happened
         elif other is not None and command is None:
             words = forecast(other, self._proposal.preview, poses, snapshot.loops.residuals)
         self._verdict.draw(edge, command.weight if isinstance(command, SetWeight) else None, words, undo)
-        self._edges.draw(snapshot.loops.edges, poses, self._shown, self._chosen, view.light)
+        self._edges.draw(snapshot.loops.edges, poses, self._shown, self.chosen, view.light)
         self._add_loop.draw_scene(snapshot, view)
-        self._inspector.draw_scene(snapshot, None if self._add_loop.nudging else self._chosen, view)
+        self._inspector.draw_scene(snapshot, None if self._add_loop.nudging else self.chosen, view)
         self._inspector.draw(snapshot, edge)
         self._edits.draw(snapshot)
         loops = snapshot.loops
@@ -170,18 +169,18 @@ class LoopsPanel:
 
     def _draw_tables(self, snapshot: Snapshot) -> None:
         loops = snapshot.loops
-        if not self._changes(loops.edges, loops.residuals, self._shown, self._order, *(self._chosen or ())):
+        if not self._changes(loops.edges, loops.residuals, self._shown, self._order, *(self.chosen or ())):
             return
         if not loops.edges:
             self._table.content = panel("quiet", _NONE_YET)
         else:
-            rows = table(listed(loops.edges, self._shown, self._order), self._order, self._chosen)
+            rows = table(listed(loops.edges, self._shown, self._order), self._order, self.chosen)
             self._table.content = self._bridge.live(chips(loops.edges, self._shown) + rows)
         self._factors.content = self._bridge.live(largest_factors(loops.residuals))
 
     def _edge(self, snapshot: Snapshot) -> LoopEdge | None:
         """The chosen loop as it is now. When it is gone, nothing is chosen."""
-        chosen = self._chosen
+        chosen = self.chosen
         edge = next((edge for edge in snapshot.loops.edges if edge.pair == chosen), None)
         if edge is not None:
             self._coming = None
@@ -205,7 +204,7 @@ class LoopsPanel:
             case ["choose", text]:
                 named = {f"{edge.older} {edge.newer}": edge.pair for edge in self._page.snapshot().loops.edges}
                 if text in named:
-                    self.choose(None if named[text] == self._chosen else named[text])
+                    self.choose(None if named[text] == self.chosen else named[text])
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = self._page.in_map(event)
@@ -222,11 +221,11 @@ class LoopsPanel:
     def _step(self, by: int) -> None:
         rows = [edge.pair for edge in listed(self._page.snapshot().loops.edges, self._shown, self._order)]
         if rows:
-            here = rows.index(self._chosen) if self._chosen in rows else (-1 if by > 0 else len(rows))
+            here = rows.index(self.chosen) if self.chosen in rows else (-1 if by > 0 else len(rows))
             self.choose(rows[min(max(here + by, 0), len(rows) - 1)])
 
     def _go(self, what: str, client: viser.ClientHandle) -> None:
-        snapshot, pair = self._page.snapshot(), self._chosen
+        snapshot, pair = self._page.snapshot(), self.chosen
         edge = next((edge for edge in snapshot.loops.edges if edge.pair == pair), None)
         if what == CLOSE or edge is None:
             self.choose(None)
@@ -247,7 +246,7 @@ class LoopsPanel:
         self._add_loop.done()
         self._inspector.show_map()
         if (pair := command.pair) is not None:
-            self._chosen = self._coming = pair  # a loop added manually arrives later
+            self.chosen = self._coming = pair  # a loop added manually arrives later
 
 
 def stand(position: F64, look_at: F64, target: F64, distance: float) -> F64:

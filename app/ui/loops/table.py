@@ -87,15 +87,8 @@ def chips(edges: tuple[LoopEdge, ...], shown: frozenset[str]) -> str:
 def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
     """The table of these edges; rows and column heads can be clicked."""
     arrow = "▾" if order.descending else "▴"
-    heads = [
-        (
-            key,
-            column.title + (arrow if key == order.column else "" if column.title else "•"),
-            column.unit,
-            column.meaning,
-        )
-        for key, column in COLUMNS.items()
-    ]
+    signs = {key: "" if column.title else "•" for key, column in COLUMNS.items()} | {order.column: arrow}
+    heads = [(key, column, signs[key]) for key, column in COLUMNS.items()]
     first, *others = COLUMNS.values()
     rows = [
         (edge, first.text(edge), kind_of(edge).colour, [column.text(edge) for column in others], edge.pair == chosen)
