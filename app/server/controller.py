@@ -245,19 +245,13 @@ class Controller:
                 self._resuming = None
                 self._player.settle_labels(session)
                 self._handle_waiting()
-        saving = POLL_S if self._saves else None
         loops = self._loops.update(session, show=not self._player.page_behind)
         labelled = session.keyframes.find_moving(last=self._player.still or session.ended)
         if labelled is not None and labelled[1]:
             self._page.show_again(labelled[0], urgent=False)
         at_work = self._resuming is None and self._georeferencing.update(session, still=self._player.still)
-        waits = [
-            wait,
-            saving,
-            POLL_S if loops or at_work else None,
-            0.0 if labelled else None,
-            self._player.look_at_source(session),
-        ]
+        poll = POLL_S if self._saves or loops or at_work else None
+        waits = [wait, poll, 0.0 if labelled else None, self._player.look_at_source(session)]
         return min((seconds for seconds in waits if seconds is not None), default=None)
 
     def _state(self, session: Session) -> State:

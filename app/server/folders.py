@@ -115,19 +115,13 @@ class Folders:
         return any(real.is_relative_to(root) for root in self.roots)
 
     def _entry(self, path: Path, suffixes: tuple[str, ...]) -> FolderEntry | None:
-        try:
-            if self._holds(path.resolve()):
-                return _entry(path, suffixes)
-        except (OSError, RuntimeError):  # a folder of another user; a link to itself
-            return None
-        return FolderEntry(path, False, outside=True) if path.suffix in suffixes else None
-
-
-def _entry(path: Path, suffixes: tuple[str, ...]) -> FolderEntry | None:
-    if path.is_dir():
-        is_recording = suffixes == RECORDINGS and (path / "metadata.yaml").is_file()
-        size = sum(file.stat().st_size for file in path.iterdir() if file.is_file()) if is_recording else 0
-        return FolderEntry(path, is_recording, size)
-    if path.suffix.lower() in suffixes and path.is_file():
-        return FolderEntry(path, True, path.stat().st_size)
-    return None
+        with contextlib.suppress(OSError, RuntimeError):  # a folder of another user; a link to itself
+            if not self._holds(path.resolve()):
+                return FolderEntry(path, False, outside=True) if path.suffix in suffixes else None
+            if path.is_dir():
+                is_recording = suffixes == RECORDINGS and (path / "metadata.yaml").is_file()
+                size = sum(file.stat().st_size for file in path.iterdir() if file.is_file()) if is_recording else 0
+                return FolderEntry(path, is_recording, size)
+            if path.suffix.lower() in suffixes and path.is_file():
+                return FolderEntry(path, True, path.stat().st_size)
+        return None

@@ -10,7 +10,7 @@ from app.server.protocol import EditLoop, RedoLoop, Snapshot, TryLoop, UndoLoop
 from app.slam.loops import edit_files
 from app.slam.loops.edits import Accept, LoopEdit, Reject, SetWeight
 from app.slam.loops.types import LoopEdge, Pair, Preview, Verdict
-from app.slam.types import F32, F64
+from app.slam.types import F64
 from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.words import BRIDGE, describe_edit, forecast, kind_of, what_happened, what_was_undone
@@ -59,12 +59,10 @@ class Ghost:
         times = enlarged(there - here, float(np.linalg.norm(np.ptp(here, axis=0))))
         if times:
             there = here + times * (there - here)
-            self._add("path", segments(there), _GHOST[light], 3.0)
-            self._add("moves", np.stack((here, there), axis=1).astype(np.float32), _STICK, 1.0)
+            sticks, root = np.stack((here, there), axis=1).astype(np.float32), f"{ROOT}/ghost"
+            self._nodes.append(add_lines(self._scene, f"{root}/path", segments(there), _GHOST[light], 3.0))
+            self._nodes.append(add_lines(self._scene, f"{root}/moves", sticks, _STICK, 1.0))
             self.key = [(_GHOST[light], name + (f", shift × {times}" if times > 1 else ""))]
-
-    def _add(self, name: str, lines: F32, colour: Rgb, width: float) -> None:
-        self._nodes.append(add_lines(self._scene, f"{ROOT}/ghost/{name}", lines, colour, width))
 
 
 def decided(command: LoopEdit) -> Pair | None:
