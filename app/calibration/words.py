@@ -9,7 +9,7 @@ import yaml
 from app.calibration.calibrate import Calibration
 from app.calibration.inertial import Noise
 from app.calibration.lines import Lines
-from app.sensors.presets import CALIBRATED, sidecar
+from app.sensors.presets import CALIBRATED, MERGED, sidecar, uncalibrated
 from app.slam.errors import HemislamError
 from app.slam.params import nested
 from app.slam.report import finite
@@ -97,17 +97,18 @@ def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
         raise HemislamError(f"Nothing that was found in {calibration.recording} can be kept: {WALK}.")
     path, text = sidecar(calibration.recording), params_yaml(calibration)
     try:
-        before = path.read_text(encoding="utf-8") if path.exists() else ""
-        if before and not before.startswith(CALIBRATED):
-            if not replace:
-                raise HemislamError(
-                    f"You wrote {path} yourself; add --force to change these values in it (it is kept as .old)."
-                )
-            tree = read_yaml(before, str(path), "write it again") or {}
+        mine = uncalibrated(calibration.recording)
+        if mine == path and not replace:
+            raise HemislamError(
+                f"You wrote {path} yourself; add --force to change these values in it (it is kept as .old)."
+            )
+        if mine is not None:
+            before = mine.read_text(encoding="utf-8")
+            tree = read_yaml(before, str(mine), "write it again") or {}
             for section, found in nested(calibration.found()).items():
                 tree[section] = (tree.get(section) or {}) | found
-            text = f"{CALIBRATED} into the one kept as .old.\n" + yaml.safe_dump(tree, default_flow_style=None)
-            path.with_name(path.name + ".old").write_text(before, encoding="utf-8")
+            text = f"{MERGED}\n{yaml.safe_dump(tree, default_flow_style=None)}"
+            path.with_name(f"{path.name}.old").write_text(before, encoding="utf-8")
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise HemislamError(f"{path} cannot be written ({error.strerror}); set the values by --set.") from None

@@ -32,7 +32,7 @@ def calibrate(
 
     The LiDAR is tracked by its scans alone, and its motion is compared with the IMU's. Walk and turn the scanner about
     all axes; values that the motion does not determine are reported as such. If a mounting is given (--preset,
-    `sensor.rotation`, `sensor.translation`), the mean of both is saved.
+    `sensor.rotation`, `sensor.translation`), the mean of both is saved. An earlier calibration does not count as given.
 
     \b
     Examples:
@@ -43,10 +43,15 @@ def calibrate(
     from app.calibration import words
     from app.calibration.calibrate import calibrate as find
     from app.cli.run import compile_behind_bar
+    from app.sensors.presets import calibrated_beside, sidecar
 
     if force and not write:
         raise HemislamError("--force belongs to --write; give both.")
-    params = params_for(recording)
+    params = params_for(recording, calibrated=False)
+    if calibrated_beside(recording):
+        typer.echo(
+            f"The earlier calibration in {sidecar(recording)} does not count: the walk is calibrated anew.", err=as_json
+        )
     compile_behind_bar()
     with progress_bar("Calibrating") as show:
         found = find(recording, params, duration, show)

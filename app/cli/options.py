@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from functools import partial
 from inspect import Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
@@ -77,8 +77,13 @@ def resolve(
     assignments: list[str] | None,
     lidar_topic: str | None = None,
     imu_topic: str | None = None,
+    *,
+    calibrated: bool = True,
 ) -> "Params":
     """Parameters from all options together; the topics' own options win over `--set`.
+
+    Args:
+        calibrated: whether a calibration beside the recording counts.
 
     Raises:
         HemislamError: as `app.sensors.presets.resolve_params`.
@@ -87,7 +92,7 @@ def resolve(
 
     topics = {"recording.lidar_topic": lidar_topic, "recording.imu_topic": imu_topic}
     flags = [f"{name}={json.dumps(topic)}" for name, topic in topics.items() if topic is not None]
-    return resolve_params(recording, preset, config, [*(assignments or []), *flags])
+    return resolve_params(recording, preset, config, [*(assignments or []), *flags], calibrated=calibrated)
 
 
 def say_calibrated(recording: Path) -> None:
@@ -98,8 +103,10 @@ def say_calibrated(recording: Path) -> None:
         typer.echo(sentence)
 
 
-ParamsFor = Callable[[Path | None], "Params"]
-"""Gives the parameters of a recording. Raises HemislamError as `resolve`."""
+class ParamsFor(Protocol):
+    """Gives the parameters of a recording. Raises HemislamError as `resolve`."""
+
+    def __call__(self, recording: Path | None, *, calibrated: bool = True) -> "Params": ...
 
 
 def with_params(command: Callable[..., None]) -> Callable[..., None]:

@@ -94,6 +94,8 @@ def preset_for(kind: str, probe: Probe) -> str:
 
 CALIBRATED = "# Written by `hemislam calibrate`"
 """First line of a parameter file that hemislam wrote."""
+MERGED = f"{CALIBRATED} into the one kept as .old."
+"""The same of a file that a user wrote and hemislam changed."""
 
 
 def sidecar(recording: Path) -> Path:
@@ -101,19 +103,42 @@ def sidecar(recording: Path) -> Path:
     return recording.parent / f"{recording.name if recording.is_dir() else recording.stem}.params.yaml"
 
 
+def uncalibrated(recording: Path) -> Path | None:
+    """The parameter file beside a recording as its user wrote it, without a calibration; None if there is none."""
+    path = sidecar(recording)
+    old, first = path.with_name(f"{path.name}.old"), _first_line(path)
+    if first.startswith(MERGED) and old.is_file():
+        return old
+    return path if path.is_file() and (first.startswith(MERGED) or not first.startswith(CALIBRATED)) else None
+
+
 def calibrated_beside(recording: Path) -> str:
     """A sentence that names the calibration beside a recording that is in use; "" if there is none."""
     path = sidecar(recording)
-    try:
-        with path.open(encoding="utf-8") as file:
-            ours = file.readline().startswith(CALIBRATED)
-    except (OSError, UnicodeDecodeError):
-        return ""
+    ours = _first_line(path).startswith(CALIBRATED)
     return f"Using the calibration beside the recording: {path}; delete it to undo this." if ours else ""
 
 
-def resolve_params(recording: Path | None, preset: str | None, config: Path | None, assignments: list[str]) -> Params:
+def _first_line(path: Path) -> str:
+    try:
+        with path.open(encoding="utf-8") as file:
+            return file.readline()
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+def resolve_params(
+    recording: Path | None,
+    preset: str | None,
+    config: Path | None,
+    assignments: list[str],
+    *,
+    calibrated: bool = True,
+) -> Params:
     """The parameters. Later ones win: defaults, preset, sidecar file, config file, assignments.
+
+    Args:
+        calibrated: whether a calibration in the sidecar file counts.
 
     Raises:
         HemislamError: unknown preset, unreadable file, unknown or out-of-range parameter.
@@ -123,8 +148,10 @@ def resolve_params(recording: Path | None, preset: str | None, config: Path | No
         if preset not in PRESETS:
             raise HemislamError(f"There is no preset `{preset}`; choose one of {', '.join(PRESETS)}.")
         params = params.merged(PRESETS[preset])
-    if recording is not None and sidecar(recording).is_file():
-        params = _with_file(params, sidecar(recording))
+    if recording is not None:
+        beside = sidecar(recording) if calibrated else uncalibrated(recording)
+        if beside is not None and beside.is_file():
+            params = _with_file(params, beside)
     if config is not None:
         params = _with_file(params, config)
     return params.with_assignments(assignments)

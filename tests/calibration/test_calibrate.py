@@ -96,6 +96,24 @@ def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path)
     assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
     assert params.sensor.translation[0] == pytest.approx(-0.011)
     assert (tmp_path / "walk.params.yaml.old").read_text() == mine
+    other = known(recording)
+    write_beside(replace(other, moved=replace(other.moved, p_imu_lidar=MID360 + 0.02)))  # again, unasked
+    params = resolve_params(recording, None, None, [])
+    assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
+    assert params.sensor.translation[0] == pytest.approx(0.009)
+    assert (tmp_path / "walk.params.yaml.old").read_text() == mine
+
+
+def test_an_earlier_calibration_does_not_count_as_given(tmp_path: Path) -> None:
+    recording, mine = tmp_path / "walk.mcap", "sensor:\n  max_range: 40\n"
+    write_beside(known(recording))
+    before = resolve_params(recording, "h2lid-mount", None, [], calibrated=False)
+    assert before == resolve_params(None, "h2lid-mount", None, [])
+    sidecar(recording).write_text(mine)
+    write_beside(known(recording), replace=True)
+    assert resolve_params(recording, None, None, [], calibrated=False) == Params().merged_yaml(mine, "mine")
+    (tmp_path / "walk.params.yaml.old").unlink()  # then nothing else has the user's parameters
+    assert resolve_params(recording, None, None, [], calibrated=False).sensor.max_range == 40
 
 
 def test_what_the_motion_does_not_determine_is_said_and_not_kept(tmp_path: Path) -> None:
