@@ -16,10 +16,9 @@ from app.slam.local_map import LocalMap, Planes
 from app.slam.sections import FilterParams
 from app.slam.types import F32, F64, Matches, NavState, Registration
 
-RESEARCH_ROTATION = 2e-3
-RESEARCH_TRANSLATION = 2e-2
-"""rad, m: planes are searched again once the state moved by more than this. The map's points are 0.15 m apart, so less
-hardly changes which of them are neighbours."""
+RESEARCH_ROTATION = 1e-3
+RESEARCH_TRANSLATION = 1e-2
+"""rad, m: planes are searched again once the state moved by more than this."""
 CONVERGED_ROTATION = 1e-5
 CONVERGED_TRANSLATION = 1e-4
 """rad, m: an increment below these ends the iteration."""
