@@ -107,9 +107,9 @@ def uncalibrated(recording: Path) -> Path | None:
     """The parameter file beside a recording as its user wrote it, without a calibration; None if there is none."""
     path = sidecar(recording)
     old, first = path.with_name(f"{path.name}.old"), _first_line(path)
-    if first.startswith(MERGED) and old.is_file():
-        return old
-    return path if path.is_file() and (first.startswith(MERGED) or not first.startswith(CALIBRATED)) else None
+    if first.startswith(MERGED):
+        return old if old.is_file() else path
+    return path if path.is_file() and not first.startswith(CALIBRATED) else None
 
 
 def calibrated_beside(recording: Path) -> str:

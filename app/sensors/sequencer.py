@@ -89,8 +89,16 @@ class Sequencer:
 
     def tail(self) -> "Sequencer":
         """A sequencer that takes over after this one's last scan, and notices what is missing in between."""
-        nothing: dict[str, Any] = {"_waiting": [], "_held": {}, "_notices": [], "_behind": False, "_suspect": None}
-        return replace(self.copy(), _stamps=self._stamps[-1:], _values=self._values[-1:], **nothing)
+        return replace(
+            self.copy(),
+            _stamps=self._stamps[-1:],
+            _values=self._values[-1:],
+            _waiting=[],
+            _held={},
+            _notices=[],
+            _behind=False,
+            _suspect=None,
+        )
 
     def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> None:
         """One IMU sample: rad/s and m/s^2, IMU frame."""

@@ -107,10 +107,11 @@ class Live:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that are free for UDP and TCP, below those that the system gives to whoever connects."""
+    """Different ports that are free for both UDP and TCP, outside the range used for outgoing connections."""
     ports: list[int] = []
+    candidates = iter(random.sample(range(20_000, 32_000), 12_000))
     while len(ports) < count:
-        port = random.randrange(20_000, 32_000)
+        port = next(candidates)
         with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
             for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
                 stack.enter_context(socket.socket(socket.AF_INET, kind)).bind(("127.0.0.1", port))

@@ -23,7 +23,6 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
     dR = np.empty((3, 3))
     Rm = np.empty((3, 3))
     Rn = np.empty((3, 3))
-    T1 = np.empty((d, d))
     w = np.empty(3)
     a = np.empty(3)
     aw = np.empty(3)
@@ -61,10 +60,8 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
             cross(B[:, j], g, aw)  # -[g]x b = b x g
             for i in range(3):
                 F[6 + i, 15 + j] = aw[i] * dt
-        T1[:] = P
-        T1[:9] = F @ P
-        P[:] = T1
-        P[:, :9] = T1 @ F.T
+        P[:9] = F @ P
+        P[:, :9] = P @ F.T
         ng, na = noise[0], noise[1]
         if bridged[s]:
             ng, na = noise[4], noise[5]

@@ -258,9 +258,7 @@ class EditsPanel:
         )
         hint = "As edits.yaml for `hemislam run --loops`."
         self._save = add_button(gui, "Save edits", self._download, viser.Icon.DOWNLOAD, hint=hint)
-        load = gui.add_upload_button(
-            "Load edits …", icon=viser.Icon.UPLOAD, color="gray", mime_type=".yaml,.yml,text/*"
-        )
+        load = gui.add_upload_button("Load edits…", icon=viser.Icon.UPLOAD, color="gray", mime_type=".yaml,.yml,text/*")
         load.on_upload(by_user(lambda file, _: self._load(file.content)))
         gui.add_command("Undo the last edit of a loop", hotkey="Z", modifier="cmd/ctrl").on_trigger(
             lambda _: send(UndoLoop())
