@@ -199,7 +199,10 @@ def add_button(
     icon: viser.IconName | None = None,
     **options: Any,
 ) -> viser.GuiButtonHandle:
-    """A button, gray unless it has another colour, that calls `act` with the browser it is clicked in; as `by_user`."""
+    """A button that calls `act` with the browser in which it is clicked; see `by_user`.
+
+    It is gray unless `color` says otherwise; None is the theme's colour.
+    """
     button = gui.add_button(text, icon=icon, **({"color": "gray"} | options))
     button.on_click(by_user(lambda _, client: act(client)))
     return button

@@ -86,7 +86,7 @@ class LoopsPanel:
         with self._residuals_folder:
             self._solve = add_button(
                 gui,
-                "Solve all at once …",
+                "Solve all at once…",
                 lambda _: self._proposal.propose(Solve()),
                 viser.Icon.MATH_FUNCTION,
                 hint=_SOLVE_HINT,
