@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.slam.kernels import map as kernels
+from app.slam.parallel import in_parts
 from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
@@ -16,6 +17,8 @@ OLD_M = 0.025
 """m: a surface is old once odometry may have drifted so far since it was last seen."""
 RELAXED = 4.0
 """Tilt allowed to a poor plane, as a multiple of that of a good one."""
+PART = 128
+"""Points for which one thread searches planes at a time, which takes some 0.2 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +113,16 @@ class LocalMap:
         normals, centers, variances = np.empty((2, n, 3)), np.zeros((2, n, 3)), np.empty((2, n))
         deviations = np.empty((2, n, 2, 3))
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
-        kernels.planes(
-            queries, position, self._voxel, reach, params.neighbours, params.plane_threshold,
-            np.array([RELAXED * tilt, tilt]), params.point_noise, self._way[3] - OLD_M**2,
-            self._table, self._cells, self._counts, self._store, normals, centers, variances, deviations,
-        )  # fmt: skip
+        tilts, old = np.array([RELAXED * tilt, tilt]), self._way[3] - OLD_M**2
+
+        def search(begin: int, end: int) -> None:
+            kernels.planes(
+                begin, end, queries, position, self._voxel, reach, params.neighbours, params.plane_threshold,
+                tilts, params.point_noise, old, self._table, self._cells, self._counts, self._store,
+                normals, centers, variances, deviations,
+            )  # fmt: skip
+
+        in_parts(search, n, PART)
         poor, good = (Planes(*parts) for parts in zip(normals, centers, variances, deviations, strict=True))
         return good, poor
 

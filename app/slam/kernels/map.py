@@ -296,10 +296,10 @@ def _is_one_side(x, y, z, eye, places, order, n, mx, my, mz, normal, flat):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def planes(
-    queries, eye, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store,
+    begin, end, queries, eye, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store,
     normals, centers, variances, deviations,
 ):  # fmt: skip
-    """Planes through the nearest map points of each query, one for each of the falling `tilts` (k,) rad.
+    """Planes through the nearest map points of queries [begin, end), one for each of the falling `tilts` (k,) rad.
 
     The `first` nearest points within `reach` m are tried first. The normal of a plane through k points of scatter s is
     uncertain by s / sqrt(k l2) rad. While that exceeds the tilt (neighbours on one scan line do not determine the
@@ -315,12 +315,12 @@ def planes(
     room = store.shape[1]
     places = store.reshape(-1, 8)
     spots, bins, order = np.empty(27 * room, np.int32), np.empty(27 * room, np.int32), np.empty(27 * room, np.int32)
-    begin = np.empty(2 * BINS + 1, np.int32)
+    starts = np.empty(2 * BINS + 1, np.int32)
     normal = np.empty(3)
-    for j in range(len(queries)):
+    for j in range(begin, end):
         x, y, z = queries[j, 0], queries[j, 1], queries[j, 2]
         present, n = _nearest(
-            x, y, z, voxel, reach * reach, old, table, cells, counts, places, room, spots, bins, begin, order
+            x, y, z, voxel, reach * reach, old, table, cells, counts, places, room, spots, bins, starts, order
         )
         _fit(
             x, y, z, eye, places, order, min(present, MOST), first, flat, tilts, noise, normal, j,
