@@ -1,5 +1,6 @@
-"""A calibration in words, as a table, as JSON and as the parameter file beside its recording."""
+"""A calibration in words, as a table, as JSON and in the parameter file beside its recording."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +79,8 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def params_yaml(calibration: Calibration) -> str:
-    """What was found as the text of a parameter file."""
-    tree = yaml.safe_dump(nested(calibration.found()), default_flow_style=None)
-    return f"{CALIBRATED}; delete this file to undo it.\n{tree}"
-
-
-def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
-    """Store what was found beside the recording, where `run`, `serve` and `info` read it.
+def write_beside(recording: Path, found: Mapping[str, Any], *, replace: bool = False) -> Path:
+    """Store what was found, by dotted name, beside the recording, where `run`, `serve` and `info` read it.
 
     Args:
         replace: a file that a person wrote, too. Its other parameters stay, and it is kept as `.old`.
@@ -93,11 +88,12 @@ def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
     Raises:
         HemislamError: nothing was found; or there is such a file.
     """
-    if not calibration.found():
-        raise HemislamError(f"Nothing that was found in {calibration.recording} can be kept: {WALK}.")
-    path, text = sidecar(calibration.recording), params_yaml(calibration)
+    if not found:
+        raise HemislamError(f"Nothing that was found in {recording} can be kept: {WALK}.")
+    path = sidecar(recording)
+    text = f"{CALIBRATED}; delete this file to undo it.\n{yaml.safe_dump(nested(found), default_flow_style=None)}"
     try:
-        mine = uncalibrated(calibration.recording)
+        mine = uncalibrated(recording)
         if mine == path and not replace:
             raise HemislamError(
                 f"You wrote {path} yourself; add --force to change these values in it (it is kept as .old)."
@@ -105,8 +101,8 @@ def write_beside(calibration: Calibration, *, replace: bool = False) -> Path:
         if mine is not None:
             before = mine.read_text(encoding="utf-8")
             tree = read_yaml(before, str(mine), "write it again") or {}
-            for section, found in nested(calibration.found()).items():
-                tree[section] = (tree.get(section) or {}) | found
+            for section, values in nested(found).items():
+                tree[section] = (tree.get(section) or {}) | values
             text = f"{MERGED}\n{yaml.safe_dump(tree, default_flow_style=None)}"
             path.with_name(f"{path.name}.old").write_text(before, encoding="utf-8")
         path.write_text(text, encoding="utf-8")

@@ -72,7 +72,7 @@ def calibrate(
         except OSError as error:
             raise HemislamError(f"{plot} cannot be written ({error.strerror}); choose another --plot.") from None
     if write:
-        path = words.write_beside(found, replace=force)
+        path = words.write_beside(recording, found.found(), replace=force)
         typer.echo(f"Saved as {path}; `run`, `serve` and `info` use it. Delete it to undo this.", err=as_json)
     elif not as_json and found.found():
         settings = " ".join(f"--set '{name}={json.dumps(value)}'" for name, value in found.found().items())

@@ -138,7 +138,15 @@ def serve(
             open_recording(opened, params).close()
         from app.ui.workbench import Workbench
 
-        return Workbench(viser, engine, folders, point_budget=point_budget, results=Path("runs"), calibrate=calibrate)
+        return Workbench(
+            viser,
+            engine,
+            folders,
+            point_budget=point_budget,
+            results=Path("runs"),
+            calibrate=calibrate,
+            resolve=params_for,
+        )
 
     with (
         TemporaryDirectory(prefix="hemislam-") as folder_live,

@@ -4,15 +4,19 @@ It begins automatically where the mounting is not known, and after a doubtful ru
 is applied at once, unless the user changed something in the meantime. A session that is continued keeps its parameters.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from app.calibration.calibrate import is_mounting_unknown
+from app.calibration.words import table, write_beside
 from app.child import Link
+from app.sensors.presets import calibrated_beside, sidecar
 from app.sensors.recording import NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.ui.background import Background
 from app.ui.html import panel
@@ -22,6 +26,11 @@ _EXPLAINED = (
     "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and what each scan line gets "
     "wrong, from the recording alone. Takes about as long as the recording."
 )
+
+
+_APPLIES = "Use these parameters, keep them beside the recording, and read it again."
+_UNDOES = "Use the parameters from before, undo what is kept beside the recording, and read it again."
+_KEEPS = "Keep these parameters beside the recording, for whenever it is opened. Undo takes that back."
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,22 +49,26 @@ class FoundMounting:
 
 
 class CalibrationPanel:
-    """A button, then the progress, then what was found with its uncertainty and a button that applies or undoes it.
+    """A button, then the progress, then what was found with its uncertainty, and a button that applies or undoes it.
 
     Args:
         unasked: begin without being asked where that helps.
+        resolve: gives the parameters of a recording, with the calibration beside it or, by `calibrated=False`, without.
     """
 
-    def __init__(self, page: Page, *, unasked: bool = False) -> None:
-        self._page, self._unasked = page, unasked
+    def __init__(self, page: Page, *, unasked: bool = False, resolve: Callable[..., Params] | None = None) -> None:
+        self._page, self._unasked, self._resolve = page, unasked, resolve
         gui = page.gui
         self._button = add_button(gui, "Calibrate", lambda _: self._begin(), color=None, hint=_EXPLAINED, disabled=True)
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._html = gui.add_html("", visible=False)
-        self._apply = add_button(gui, "Apply", lambda _: self._use(), color=None, visible=False)
+        self._apply = add_button(gui, "Apply", lambda _: self._apply_or_undo(), color=None, visible=False)
+        self._keep = add_button(gui, "Keep", lambda _: self._write(), hint=_KEEPS, visible=False)
         self._plot = gui.add_html("", visible=False)
         self._work = Background("calibrate", "Calibration")
-        self._values: dict[str, Any] = {}
+        self._found = FoundMounting([], {})
+        self._before: dict[str, Any] = {}  # values that those found replaced; empty unless these are in use
+        self._file: bytes | None = None  # the parameter file beside the recording, before it was written
         self._sentence = ""  # for the report, once the values are applied
         self._given = Params()
         self._of: Path | None = None
@@ -67,8 +80,8 @@ class CalibrationPanel:
         recording = snapshot.recording.path if snapshot.recording else None
         if recording != self._of:  # what was found belongs to another one
             self.close()
-            self._of, self._values, self._tried = recording, {}, not self._unasked
-            self._html.visible = self._apply.visible = self._plot.visible = False
+            self._of, self._found, self._before, self._tried = recording, FoundMounting([], {}), {}, not self._unasked
+            self._html.visible = self._apply.visible = self._keep.visible = self._plot.visible = False
             self._heard = snapshot.last_notice
         self._button.disabled = self._work.running or recording is None or recording == LIVE
         doubted = any(one.number > self._heard and one.text.startswith(IN_DOUBT) for one in snapshot.notices)
@@ -90,22 +103,28 @@ class CalibrationPanel:
             return
         self.close()
         found = message if isinstance(message, FoundMounting) else FoundMounting([("", message)], {})
-        self._values = found.values
-        rows = [("", f"{found.contradiction}."), *found.rows] if found.contradiction else found.rows
-        self._html.content, self._html.visible = panel("calibration", rows), True
+        if found.contradiction:
+            found = replace(found, rows=[("", f"{found.contradiction}."), *found.rows])
+        self._found, self._before = found, {}
+        self._tell()
         self._plot.content, self._plot.visible = panel("figure", found.plot), bool(found.plot)
-        self._offer("Apply", "Set these parameters and read the recording again.")
+        self._offer()
         self._sentence = ""
         if found.contradiction and found.values:
             self._sentence = f"{found.contradiction}; this was found in the recording and is used."
         if not self._asked and found.contradiction:
-            self._use_or_offer(found.contradiction)
+            self._use_or_advise(found.contradiction)
 
-    def _use_or_offer(self, contradiction: str) -> None:
+    def _tell(self, *more: tuple[str, str]) -> None:
+        """Show what was found, and what became of it."""
+        self._html.content, self._html.visible = panel("calibration", [*self._found.rows, *more]), True
+
+    def _use_or_advise(self, contradiction: str) -> None:
         """Use what was found unasked where nothing else is known; elsewhere say how to apply it."""
         snapshot = self._page.snapshot()
         if _is_unknown(snapshot) and snapshot.params == self._given and not _has_edits(snapshot):
             self._use()
+            self._keep.visible = True
         else:
             self._page.send(Calibrated(f"{contradiction}. To apply it, see Calibration under Recording."))
 
@@ -123,33 +142,82 @@ class CalibrationPanel:
         snapshot = self._page.snapshot()
         if self._work.running or snapshot.recording is None or self._button.disabled:
             return
-        self._asked, self._tried, self._given = asked, True, snapshot.params
+        recording, params = snapshot.recording.path, snapshot.params
+        self._asked, self._tried, self._given = asked, True, params
         self._notified.clear()
         self._progress.value = 0.0  # type: ignore[misc]  # as above
-        self._progress.visible, self._apply.visible = True, False
-        self._work.begin(find, snapshot.recording.path, snapshot.params)
+        self._progress.visible, self._apply.visible, self._keep.visible = True, False, False
+        try:
+            self._work.begin(find, recording, self._uncalibrated(recording, params))
+        except HemislamError as error:
+            self._show(str(error))
+
+    def _uncalibrated(self, recording: Path, params: Params) -> Params:
+        """These parameters without what was found in this recording before; else its walk would count twice."""
+        used = params.with_values(self._found.values)
+        without = {name: value for name, value in self._before.items() if params.value(name) == used.value(name)}
+        if self._resolve is not None and calibrated_beside(recording):
+            used, given = self._resolve(recording), self._resolve(recording, calibrated=False)
+            beside = used.changed(given).items()
+            without = {name: value for name, value in beside if params.value(name) == used.value(name)} | without
+        return params.with_values(without)
+
+    def _apply_or_undo(self) -> None:
+        if self._before:
+            self._undo()
+        elif self._found.values:
+            self._use()
+            self._write()
 
     def _use(self) -> None:
-        """Set what was found; or, once that is done, what was there before. Then go on from the same frame."""
-        if not self._values:
-            return
-        snapshot, undoing = self._page.snapshot(), self._apply.label == "Undo"
-        params, transport = snapshot.params, snapshot.transport
-        before = {path: params.value(path) for path in self._values}
-        self._page.send(SetParams(dict(self._values)))
+        """Set what was found."""
+        params = self._page.snapshot().params
+        self._before = {name: params.value(name) for name in self._found.values}
+        self._set(dict(self._found.values), self._sentence)
+
+    def _undo(self) -> None:
+        """Set what was there before, and put the parameter file back as it was."""
+        self._set(self._before, "")
+        self._before = {}
+        kept, self._keep.visible = not self._keep.visible, False
+        self._offer()
+        self._tell()
+        if kept and self._of is not None:
+            try:
+                if self._file is None:
+                    sidecar(self._of).unlink(missing_ok=True)
+                else:
+                    sidecar(self._of).write_bytes(self._file)
+            except OSError as error:
+                self._tell(("kept", f"{sidecar(self._of)} cannot be put back ({error.strerror}); delete it"))
+
+    def _write(self) -> None:
+        """Keep what was found beside the recording."""
+        assert self._of is not None
+        path = sidecar(self._of)
+        self._keep.visible = False
+        try:
+            self._file = path.read_bytes() if path.is_file() else None
+            write_beside(self._of, self._found.values, replace=True)
+            self._tell(("kept", f"in {path}, for whenever this recording is opened"))
+        except (HemislamError, OSError) as error:
+            self._keep.visible = True
+            self._tell(("not kept", str(error)))
+
+    def _set(self, values: dict[str, Any], sentence: str) -> None:
+        """Set parameters, begin anew with them, and go on from the frame that was shown."""
+        transport = self._page.snapshot().transport
+        self._page.send(SetParams(values))
         self._page.send(Restart())
-        self._page.send(Calibrated("" if undoing else self._sentence))
+        self._page.send(Calibrated(sentence))
         if transport.frame > 0:
             self._page.send(Seek(transport.frame + transport.finished))
-        self._values = before
-        if undoing:
-            self._offer("Apply", "Set what was found again.")
-        else:
-            self._offer("Undo", "Set what was there before, and read the recording again.")
+        self._offer()
 
-    def _offer(self, label: str, hint: str) -> None:
+    def _offer(self) -> None:
+        label, hint = ("Undo", _UNDOES) if self._before else ("Apply", _APPLIES)
         self._apply.label, self._apply.hint = label, hint
-        self._apply.visible = bool(self._values)
+        self._apply.visible = bool(self._found.values)
 
 
 def _is_unknown(snapshot: Snapshot) -> bool:
@@ -167,7 +235,6 @@ def _has_edits(snapshot: Snapshot) -> bool:
 def find(owner: Link, recording: Path, params: Params) -> None:
     """In a process of its own: sends fractions done, then what was found."""
     from app.calibration.calibrate import calibrate
-    from app.calibration.words import table
     from app.evaluation.plots import residual_plot
 
     found = calibrate(recording, params, progress=lambda fraction: owner.send(float(fraction)))

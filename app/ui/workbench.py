@@ -21,6 +21,7 @@ from app.server.fork import Workspace
 from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET, Setup
 from app.server.worker import RunningEngine
+from app.slam.params import Params
 from app.ui.appearance import AppearancePanel, apply_theme
 from app.ui.brush import BrushPanel
 from app.ui.calibration import CalibrationPanel
@@ -66,6 +67,7 @@ class Workbench:
         folders: where recordings may be opened from. point_budget: of the engine's reader, shown to the user.
         results: folder below which results are saved.
         now: monotonic seconds. calibrate: begin calibrations without being asked, where they help.
+        resolve: see `CalibrationPanel`.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class Workbench:
         results: Path = Path("results"),
         now: Callable[[], float] = time.monotonic,
         calibrate: bool = False,
+        resolve: Callable[..., Params] | None = None,
     ) -> None:
         forks = engine if isinstance(engine, Workspace) else Workspace(engine, Setup(), lambda _: engine)
         self._server = server
@@ -142,7 +145,7 @@ class Workbench:
             self._live = LivePanel(gui)
             self._doctor = DoctorPanel(page)
             with gui.add_folder("Calibration", expand_by_default=False):
-                self._calibration = CalibrationPanel(page, unasked=calibrate)
+                self._calibration = CalibrationPanel(page, unasked=calibrate, resolve=resolve)
             with gui.add_folder("Georeference", expand_by_default=False):
                 self._georeference = GeoreferencePanel(page, folders, self._measure)
             with gui.add_folder("Notes"):

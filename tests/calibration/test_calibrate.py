@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -18,7 +17,7 @@ from app.calibration.calibrate import calibrate, calibrate_excerpt
 from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.lines import Lines
 from app.calibration.odometry import track
-from app.calibration.words import WALK, as_json, params_yaml, table, write_beside
+from app.calibration.words import WALK, as_json, table, write_beside
 from app.evaluation.plots import residual_plot
 from app.sensors.presets import calibrated_beside, resolve_params, sidecar
 from app.sensors.recording import open_recording
@@ -72,12 +71,12 @@ def test_the_scans_alone_give_the_turns_of_the_first_steps_outdoors(shared_data:
 
 def test_what_was_found_is_kept_beside_the_recording_and_undone_by_deleting_it(tmp_path: Path) -> None:
     recording = tmp_path / "walk.mcap"
-    path = write_beside(known(recording))
+    path = write_beside(recording, known(recording).found())
     params = resolve_params(recording, "mid360", None, [])
     assert np.allclose(params.sensor.rotation, [70.0, -50.0, 104.0], atol=1e-2)
     assert params.recording.imu_time_offset == pytest.approx(0.02)
     assert str(path) in calibrated_beside(recording)
-    write_beside(known(recording))  # its own file may be replaced
+    write_beside(recording, known(recording).found())  # its own file may be replaced
     path.unlink()
     assert calibrated_beside(recording) == ""
     assert resolve_params(recording, None, None, []) == Params()
@@ -88,16 +87,17 @@ def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path)
     mine = "# mine\nsensor:\n  max_range: 40\nfilter:\n  max_points: 700\n"
     sidecar(recording).write_text(mine)
     with pytest.raises(HemislamError, match="yourself; add --force"):
-        write_beside(known(recording))
+        write_beside(recording, known(recording).found())
     assert sidecar(recording).read_text() == mine
     assert calibrated_beside(recording) == ""
-    write_beside(known(recording), replace=True)
+    write_beside(recording, known(recording).found(), replace=True)
     params = resolve_params(recording, None, None, [])
     assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
     assert params.sensor.translation[0] == pytest.approx(-0.011)
     assert (tmp_path / "walk.params.yaml.old").read_text() == mine
     other = known(recording)
-    write_beside(replace(other, moved=replace(other.moved, p_imu_lidar=MID360 + 0.02)))  # again, unasked
+    again = replace(other, moved=replace(other.moved, p_imu_lidar=MID360 + 0.02))
+    write_beside(recording, again.found())  # unasked
     params = resolve_params(recording, None, None, [])
     assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
     assert params.sensor.translation[0] == pytest.approx(0.009)
@@ -106,11 +106,11 @@ def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path)
 
 def test_an_earlier_calibration_does_not_count_as_given(tmp_path: Path) -> None:
     recording, mine = tmp_path / "walk.mcap", "sensor:\n  max_range: 40\n"
-    write_beside(known(recording))
+    write_beside(recording, known(recording).found())
     before = resolve_params(recording, "h2lid-mount", None, [], calibrated=False)
     assert before == resolve_params(None, "h2lid-mount", None, [])
     sidecar(recording).write_text(mine)
-    write_beside(known(recording), replace=True)
+    write_beside(recording, known(recording).found(), replace=True)
     assert resolve_params(recording, None, None, [], calibrated=False) == Params().merged_yaml(mine, "mine")
     (tmp_path / "walk.params.yaml.old").unlink()  # then nothing else has the user's parameters
     assert resolve_params(recording, None, None, [], calibrated=False).sensor.max_range == 40
@@ -121,12 +121,12 @@ def test_what_the_motion_does_not_determine_is_said_and_not_kept(tmp_path: Path)
     assert [text for _, text in table(found)[:3]] == [WALK] * 3
     assert found.found() == {} and found.contradiction() == ""
     with pytest.raises(HemislamError, match="can be kept"):
-        write_beside(found)
+        write_beside(tmp_path / "walk.mcap", found.found())
 
 
 def test_a_mounting_that_agrees_with_the_parameters_is_no_contradiction(tmp_path: Path) -> None:
-    values = yaml.safe_load(params_yaml(known(tmp_path / "walk.mcap")))
-    right = Params().merged({"sensor": values["sensor"]})
+    values = known(tmp_path / "walk.mcap").found()
+    right = Params().with_values({name: value for name, value in values.items() if name.startswith("sensor.")})
     found = known(tmp_path / "walk.mcap", params=right)
     assert "turned" not in found.contradiction() and "ms" in found.contradiction()
 
@@ -147,10 +147,10 @@ def test_a_given_mounting_counts_as_much_as_a_drawing_unless_it_is_surely_wrong(
 def test_what_was_given_is_saved_with_what_was_found(tmp_path: Path) -> None:
     """Calibrating twice keeps the clock of the first time, and a saved file needs no preset beside it."""
     recording = tmp_path / "walk.mcap"
-    first = resolve_params(write_beside(known(recording)).with_name("walk.mcap"), None, None, [])
+    first = resolve_params(write_beside(recording, known(recording).found()).with_name("walk.mcap"), None, None, [])
     again = known(recording, params=first)
     again = replace(again, turned=replace(again.turned, late=0.0), moved=replace(again.moved, covariance=np.eye(6)))
-    params = resolve_params(write_beside(again).with_name("walk.mcap"), None, None, [])
+    params = resolve_params(write_beside(recording, again.found()).with_name("walk.mcap"), None, None, [])
     assert params.recording.imu_time_offset == pytest.approx(0.02)
     assert np.allclose(params.sensor.translation, MID360, atol=1e-4)
 
@@ -185,6 +185,6 @@ def test_errors_of_scan_lines_are_told_drawn_and_kept(tmp_path: Path) -> None:
     assert json.loads(json.dumps(as_json(found)))["lines"]["residuals_m"][0][3] is None
     assert "points on planes" in residual_plot(found)
     ElementTree.fromstring(residual_plot(found))
-    params = resolve_params(write_beside(found).with_name("walk.mcap"), None, None, [])
+    params = resolve_params(write_beside(tmp_path / "walk.mcap", found.found()).with_name("walk.mcap"), None, None, [])
     assert params.sensor.elevation_corrections == "0.2 -0.2 0.1 0"
     assert params.sensor.range_corrections == "0.01 -0.01 0.002 0"

@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 import viser
 
+from app.calibration.words import write_beside
 from app.mapping.kept import Note
+from app.sensors.presets import calibrated_beside, resolve_params, sidecar
 from app.sensors.recording import NO_IMU
 from app.server.protocol import (
     Calibrated,
@@ -29,6 +31,10 @@ FOUND = {"sensor.rotation": [70.0, -50.0, 104.0]}
 OPEN = Snapshot(recording=OpenedRecording(Path("walk.mcap"), 0, 30.0, 300, ()))
 
 
+def with_preset(recording: Path, *, calibrated: bool = True) -> Params:
+    return resolve_params(recording, "h2lid-mount", None, [], calibrated=calibrated)
+
+
 class Process:
     """Stands for the process; the test says what it sends."""
 
@@ -46,19 +52,27 @@ class Calibrating:
     def __init__(self, server: viser.ViserServer, *, unasked: bool = False) -> None:
         self.sent: list[Command] = []
         self.now = OPEN
-        self.panel = CalibrationPanel(page_of(server, self.sent.append, lambda: self.now), unasked=unasked)
+        page = page_of(server, self.sent.append, lambda: self.now)
+        self.panel = CalibrationPanel(page, unasked=unasked, resolve=with_preset)
 
     def draw(self, now: Snapshot) -> None:
         self.now = now
         self.panel.draw(now)
+
+    def found(self, message: Any) -> None:
+        """The user asks for a calibration, which finds this."""
+        user_clicks(self.panel._button)
+        self.process().messages.append(message)
+        self.draw(self.now)
 
     def process(self) -> Any:
         return self.panel._work._child
 
 
 @pytest.fixture
-def page(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> Calibrating:
+def page(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calibrating:
     monkeypatch.setattr(background, "Child", Process)
+    monkeypatch.chdir(tmp_path)
     page = Calibrating(server)
     page.draw(OPEN)
     return page
@@ -82,6 +96,58 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert page.sent == [SetParams(FOUND), Restart(), Calibrated("")] and "<svg/>" in panel._plot.content
     user_clicks(panel._apply)
     assert page.sent[3:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart(), Calibrated("")]
+
+
+WALK = Path("walk.mcap")
+GIVEN = with_preset(WALK)
+
+
+def test_what_is_applied_is_kept_beside_the_recording_until_it_is_undone(page: Calibrating) -> None:
+    page.found(FoundMounting([], FOUND))
+    user_clicks(page.panel._apply)
+    assert with_preset(WALK) == GIVEN.with_values(FOUND)
+    assert "kept" in page.panel._html.content and str(sidecar(WALK)) in page.panel._html.content
+    assert not page.panel._keep.visible
+    user_clicks(page.panel._apply)
+    assert not sidecar(WALK).exists() and "kept" not in page.panel._html.content
+
+
+def test_undoing_brings_a_file_back_that_somebody_wrote(page: Calibrating) -> None:
+    mine = "# mine\nsensor:\n  rotation: [1, 2, 3]\n  max_range: 40\n"
+    sidecar(WALK).write_text(mine)
+    page.found(FoundMounting([], FOUND))
+    user_clicks(page.panel._apply)
+    sensor = with_preset(WALK).sensor
+    assert (sensor.rotation, sensor.max_range) == ((70.0, -50.0, 104.0), 40)
+    user_clicks(page.panel._apply)
+    assert sidecar(WALK).read_text() == mine
+
+
+def test_what_cannot_be_kept_is_used_all_the_same_and_said(page: Calibrating) -> None:
+    sidecar(WALK).mkdir()
+    page.found(FoundMounting([], FOUND))
+    user_clicks(page.panel._apply)
+    assert page.sent[0] == SetParams(FOUND) and "not kept" in page.panel._html.content and page.panel._keep.visible
+    sidecar(WALK).rmdir()
+    user_clicks(page.panel._keep)
+    assert calibrated_beside(WALK) and not page.panel._keep.visible
+
+
+def test_calibrating_again_counts_nothing_that_was_found_before(page: Calibrating) -> None:
+    page.draw(replace(OPEN, params=GIVEN))
+    page.found(FoundMounting([], FOUND))
+    user_clicks(page.panel._apply)
+    page.draw(replace(OPEN, params=GIVEN.with_values(FOUND)))
+    user_clicks(page.panel._button)
+    assert page.process().arguments == (WALK, GIVEN)
+
+
+def test_a_calibration_beside_the_recording_does_not_count_either(page: Calibrating) -> None:
+    write_beside(WALK, FOUND | {"recording.imu_time_offset": 0.02})
+    page.draw(replace(OPEN, params=with_preset(WALK).with_values({"recording.imu_time_offset": 0.03})))
+    user_clicks(page.panel._button)
+    mine = GIVEN.with_values({"recording.imu_time_offset": 0.03})
+    assert page.process().arguments == (WALK, mine), "what the user set since then stays"
 
 
 def test_what_cannot_be_reported_is_said_and_nothing_is_offered(page: Calibrating) -> None:
@@ -113,8 +179,9 @@ ADVICE = Calibrated(f"{TOLD.contradiction}. To apply it, see Calibration under R
 
 
 @pytest.fixture
-def unasked(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> Calibrating:
+def unasked(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calibrating:
     monkeypatch.setattr(background, "Child", Process)
+    monkeypatch.chdir(tmp_path)
     return Calibrating(server, unasked=True)
 
 
@@ -125,6 +192,7 @@ def test_an_unknown_mounting_is_found_and_used_on_opening_and_undone_by_a_click(
     told = Calibrated(f"{TOLD.contradiction}; this was found in the recording and is used.")
     assert unasked.sent == [SetParams(FOUND), Restart(), told] and unasked.panel._apply.label == "Undo"
     assert "turned by 70°" in unasked.panel._html.content
+    assert not sidecar(WALK).exists() and unasked.panel._keep.visible, "nobody asked for a file"
     unasked.draw(replace(OPEN, params=Params().with_values(FOUND)))
     unasked.draw(OPEN)
     assert unasked.process() is None, "it begins once for each recording"
