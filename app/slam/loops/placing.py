@@ -61,16 +61,21 @@ def place(
         most_slide: m, up to which a direction holds.
     """
     starts = [T_guess, *(placements(target, source, T_guess, window) if window.reach_m >= APART_M else ())]
-    fits: list[Fit] = []
+    found: list[F64] = []
     for rough_T in _worthwhile([rough(target, source, start) for start in starts]):
         T = register(target, source, rough_T)
-        if not any(_apart(T, fit.T_target_source) < 1.0 for fit in fits):
-            fits.append(assess(target, source, T))
-    best = max(fits, key=lambda fit: fit.overlap)
-    good = [fit for fit in fits if fit is best or _as_good(fit, best)]  # without overlap it is not even itself
-    allowed = [fit for fit in good if deviation(fit.T_target_source) <= most_sigmas] or good
-    chosen = max(allowed, key=lambda fit: fit.overlap)
-    fit = assess(target, source, refine(target, source, chosen.T_target_source))
+        if not any(_apart(T, other) < 1.0 for other in found):
+            found.append(T)
+    if len(found) > 1:
+        fits = [assess(target, source, T) for T in found]
+        best = max(fits, key=lambda fit: fit.overlap)
+        good = [fit for fit in fits if fit is best or _as_good(fit, best)]  # without overlap it is not even itself
+        allowed = [fit for fit in good if deviation(fit.T_target_source) <= most_sigmas] or good
+        chosen = max(allowed, key=lambda fit: fit.overlap).T_target_source
+        others = [fit.T_target_source for fit in allowed if fit.T_target_source is not chosen]
+    else:
+        chosen, others = found[0], []
+    fit = assess(target, source, refine(target, source, chosen))
     if window is not EVERYWHERE and deviation(fit.T_target_source) > most_sigmas:
         return place(target, source, T_guess, EVERYWHERE, deviation, most_sigmas, most_slide)
 
@@ -82,7 +87,7 @@ def place(
         T = fit.T_target_source.copy()
         T[:3, 3] += weakest * (weakest @ (T_guess - T)[:3, 3])
         fit = assess(target, source, T)
-    ways = [other.T_target_source[:3, 3] - chosen.T_target_source[:3, 3] for other in allowed if other is not chosen]
+    ways = [other[:3, 3] - chosen[:3, 3] for other in others]
     lengths = [float(np.linalg.norm(way)) for way in ways if not (is_open and _along(way, weakest))]
     return Placement(
         fit=fit,

@@ -212,5 +212,7 @@ def _near(points: F64, origin: F64) -> Mask:
 
 
 def _nearest(target: Prepared, points: F64) -> tuple[I64, F64]:
-    index, squared = target.tree.batch_nearest_neighbor_search(points, ONE_THREAD)
-    return np.asarray(index, np.int64), np.asarray(squared, np.float64)
+    index, squared = target.tree.batch_knn_search(
+        points, 1, ONE_THREAD
+    )  # faster than the search for one, which makes lists
+    return index[:, 0].astype(np.int64), squared[:, 0]
