@@ -26,8 +26,6 @@ _EXPLAINED = (
     "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and what each scan line gets "
     "wrong, from the recording alone. Takes about as long as the recording."
 )
-
-
 _APPLIES = "Use these parameters, keep them beside the recording, and read it again."
 _UNDOES = "Use the parameters from before, undo what is kept beside the recording, and read it again."
 _KEEPS = "Keep these parameters beside the recording, for whenever it is opened. Undo takes that back."
