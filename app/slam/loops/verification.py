@@ -104,7 +104,7 @@ class Fit:
 def prepare(submap: Submap) -> Prepared:
     points = submap.points.astype(np.float64)
     tree = small_gicp.KdTree(points, ONE_THREAD)
-    index, _ = tree.batch_knn_search(points, NEIGHBOURS, ONE_THREAD)
+    index, _ = tree.batch_knn_search(points, min(NEIGHBOURS, max(len(points), 1)), ONE_THREAD)
     normals, flat = np.empty_like(points), np.empty(len(points), np.bool_)
     patches.planes(points, np.asarray(index, np.int64), submap.eyes, FLAT_M, normals, flat)
     level = flat & (np.abs(normals[:, 2]) > LEVEL)
@@ -212,7 +212,9 @@ def _near(points: F64, origin: F64) -> Mask:
 
 
 def _nearest(target: Prepared, points: F64) -> tuple[I64, F64]:
-    index, squared = target.tree.batch_knn_search(
-        points, 1, ONE_THREAD
-    )  # faster than the search for one, which makes lists
+    """Index and squared distance (m²) of the nearest point of the target; infinitely far if it has none."""
+    if not len(target.points):
+        return np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    # the search for k neighbours returns arrays, unlike the search for one, so it is faster
+    index, squared = target.tree.batch_knn_search(points, 1, ONE_THREAD)
     return index[:, 0].astype(np.int64), squared[:, 0]

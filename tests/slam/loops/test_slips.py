@@ -13,7 +13,7 @@ from app.slam.loops.detection import Detector
 from app.slam.loops.search import Search
 from app.slam.loops.slips import REACH, slip
 from app.slam.sections import LoopsParams
-from app.slam.types import F64, Keyframe
+from app.slam.types import F64, Cloud, Keyframe
 from tests.slam.loops.test_verification import FINS, corridor, pose, seen
 from tests.slam.loops.walks import Walk, take
 
@@ -97,4 +97,18 @@ def test_the_graph_may_bend_where_odometry_slipped_once_that_is_seen(straight: W
     assert sigma_m(AT) > 0.3 and sigma_m(AT - REACH) < 0.03
     search.go_to(AT + REACH - 1)
     assert sigma_m(AT) < 0.03, "it was not seen yet"
+    search.close()
+
+
+def test_where_the_scanner_saw_nothing_for_a_while_no_slip_is_reported_and_the_search_goes_on(straight: Walk) -> None:
+    search, dark = Search(), range(4, 4 + 3 * REACH)
+    for keyframe in straight.keyframes:
+        if keyframe.index in dark:
+            seen = keyframe.cloud
+            nothing = Cloud(seen.points[:0], seen.labels[:0], seen.intensity[:0], seen.ring[:0], seen.offsets_ns[:0])
+            keyframe = replace(keyframe, cloud=nothing)
+        search.add(keyframe, LoopsParams(submap_keyframes=2, min_time=1.0))
+    search.finish()
+    assert len(search) == len(straight.keyframes) > dark.stop + REACH
+    assert [k for k in range(1, len(search)) if search.detector.slip(k) is not None] == []
     search.close()

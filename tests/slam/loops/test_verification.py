@@ -97,3 +97,15 @@ def test_the_information_is_that_of_small_motions() -> None:
             costs.append(float(np.sum(assess(target, source, moved).residuals ** 2)))
         curvature = (costs[0] - 2 * costs[1] + costs[2]) / step[axis] ** 2
         assert curvature / 2 == pytest.approx(fit.information[3 + axis, 3 + axis], rel=0.3), "partners change a little"
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_a_place_of_few_points_or_none_shares_nothing_with_another(count: int) -> None:
+    few = seen(corridor(np.random.default_rng(0))[:count], np.eye(4))
+    full = seen(corridor(np.random.default_rng(1), FINS), np.eye(4))
+    for target, source in ((few, full), (full, few), (few, few)):
+        T = refine(target, source, register(target, source, rough(target, source, np.eye(4))[0]))
+        fit = assess(target, source, T)
+        assert np.isfinite(T).all() and fit.overlap == 0.0
+        assert slide(target, source, fit, fit.directions[0]) < np.inf
+        assert count > 1 or not len(fit.residuals)
