@@ -50,8 +50,8 @@ class Prepared:
     Attributes:
         points: (n, 3). normals: (n, 3) unit, towards where the point was seen from.
         flat: (n,) bool. level: (n,) of ground; upright: (n,) of what is neither ground nor ceiling.
-        tree: over the points. chosen, few: indices of flat points that take part as source, and of those that do
-            for a rough answer. judged: indices of upright points on which overlap is judged.
+        tree: over the points; None if there are none. chosen, few: indices of flat points that take part as source, and
+            of those that do for a rough answer. judged: indices of upright points on which overlap is judged.
     """
 
     submap: Submap
@@ -60,7 +60,7 @@ class Prepared:
     flat: Mask
     level: Mask
     upright: Mask
-    tree: small_gicp.KdTree
+    tree: small_gicp.KdTree | None
     chosen: I64
     few: I64
     judged: I64
@@ -103,10 +103,11 @@ class Fit:
 
 def prepare(submap: Submap) -> Prepared:
     points = submap.points.astype(np.float64)
-    tree = small_gicp.KdTree(points, ONE_THREAD)
-    index, _ = tree.batch_knn_search(points, min(NEIGHBOURS, max(len(points), 1)), ONE_THREAD)
-    normals, flat = np.empty_like(points), np.empty(len(points), np.bool_)
-    patches.planes(points, np.asarray(index, np.int64), submap.eyes, FLAT_M, normals, flat)
+    tree, normals, flat = None, np.empty_like(points), np.empty(len(points), np.bool_)
+    if len(points):  # small_gicp crashes when it searches a tree without points
+        tree = small_gicp.KdTree(points, ONE_THREAD)
+        index, _ = tree.batch_knn_search(points, min(NEIGHBOURS, len(points)), ONE_THREAD)
+        patches.planes(points, np.asarray(index, np.int64), submap.eyes, FLAT_M, normals, flat)
     level = flat & (np.abs(normals[:, 2]) > LEVEL)
     chosen, few = _thinned(flat, MOST_POINTS), _thinned(flat, FEW_POINTS)
     ground, upright = level & (normals[:, 2] > 0), ~level
@@ -213,7 +214,7 @@ def _near(points: F64, origin: F64) -> Mask:
 
 def _nearest(target: Prepared, points: F64) -> tuple[I64, F64]:
     """Index and squared distance (m²) of the nearest point of the target; infinitely far if it has none."""
-    if not len(target.points):
+    if target.tree is None:
         return np.zeros(len(points), np.int64), np.full(len(points), np.inf)
     # the search for k neighbours returns arrays, unlike the search for one, so it is faster
     index, squared = target.tree.batch_knn_search(points, 1, ONE_THREAD)
