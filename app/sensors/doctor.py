@@ -156,10 +156,11 @@ def _imu_gaps(counts: Counts, limit_s: float) -> Finding:
     if not counts.imu_gaps:
         return Finding("IMU gaps", "fine", f"none longer than {limit_s:g} s")
     longest = counts.longest_imu_gap_s
-    text = f"{counts.imu_gaps} longer than {limit_s:g} s, the longest {longest:.3f} s; scans inside are left out"
-    # A short gap can be bridged for the scans inside as well; over a long one the pose would be a guess.
-    option = f"--set imu.max_gap={longest + 0.01:.2f}" if longest < 0.3 else ""
-    return Finding("IMU gaps", "needs you", text, option)
+    text = (
+        f"{counts.imu_gaps} longer than {limit_s:g} s, the longest {longest:.3f} s; "
+        "there only the scans show the motion: check the IMU's cable and driver"
+    )
+    return Finding("IMU gaps", "needs you", text)
 
 
 def _imu_time(counts: Counts) -> Finding:

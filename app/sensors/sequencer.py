@@ -57,8 +57,8 @@ class Sequencer:
     """The one place that guarantees IMU coverage of a scan, by samples that an IMU can have measured.
 
     Attributes:
-        limits: `max_gap`: a longer interval between IMU samples is a gap: reported, and a scan that lies mostly
-            inside it is dropped. `max_rate`, `max_acceleration`: samples beyond are refused.
+        limits: `max_gap`: a longer interval between IMU samples is a gap, and reported. `max_rate`,
+            `max_acceleration`: samples beyond are refused.
         without_imu: there is no IMU: scans go out as they come, without samples.
         counts: gaps, repeated samples and the like.
     """
@@ -224,7 +224,7 @@ class Sequencer:
         if scan.refused:
             self._notices.append("points beyond 10 km or without a time were left out")
         imu = self._samples(first, last + 1)
-        gaps = np.diff(imu.stamps_ns) / 1e9
+        gaps = np.diff(imu.stamps_ns)[imu.stamps_ns[:-1] >= begin_ns] / 1e9  # earlier ones came with the scan before
         self._notices += [f"no IMU sample for {gap:.3f} s" for gap in gaps[gaps > self.limits.max_gap]]
         measurement = Measurement(scan, imu, tuple(self._notices), self._take_streams(end_ns))
         self._notices.clear()
@@ -259,12 +259,6 @@ class Sequencer:
             return "the IMU starts after it"
         if end_ns > self._stamps[-1]:
             return "the IMU stops before its end"
-        first = bisect.bisect_right(self._stamps, begin_ns) - 1
-        last = bisect.bisect_left(self._stamps, end_ns)
-        for before, after in zip(self._stamps[first:last], self._stamps[first + 1 : last + 1], strict=True):
-            inside = min(after, end_ns) - max(before, begin_ns)
-            if after - before > self.limits.max_gap * 1e9 and inside > 0.5 * (end_ns - begin_ns):
-                return "it lies in a gap of the IMU"
         return ""
 
     def _note_missing_scans(self, scan: Scan) -> None:

@@ -94,6 +94,7 @@ class Engine:
         clock = before.clock if p.imu.learn_clock else ClockOffset()
         samples = clock.set_right(samples)
         gap_s = float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9
+        gapless = gap_s <= p.imu.max_gap
 
         belief, still, waiting = before.belief, before.still, False
         if belief is None and not len(samples):
@@ -105,7 +106,7 @@ class Engine:
             notices += [started.notice] if started.notice else []
         if len(samples):
             predicted, path = imu.propagate(belief, samples, end_ns, p.imu, clock.sigma)
-            predicted = rest.hold(predicted, samples)
+            predicted = rest.hold(predicted, samples) if gapless else predicted
             watch.lap("propagate")
             points = imu.deskew(scan, path, predicted.state)
         else:
@@ -128,7 +129,7 @@ class Engine:
         if self._map.voxels:
             if len(samples):
                 chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-                fuse = partial(iekf.update, predicted, chosen, gapless=gap_s <= p.imu.max_gap)
+                fuse = partial(iekf.update, predicted, chosen, gapless=gapless)
                 posterior, registration = self._update(belief, predicted, fuse)
             else:  # the points themselves, since centroids have no time
                 source = reduced.source[sampled.source]
@@ -149,7 +150,7 @@ class Engine:
         if due and last is not None and status is FrameStatus.TRACKING and p.filter.learn_lines:
             walked = float(np.linalg.norm(here[:3, 3] - last[:3, 3]))
             lines = lines.learnt(posterior, points, scan.ring, walked, self._map, p.filter)
-        if registration.inliers and status is FrameStatus.TRACKING and len(samples) and p.imu.learn_clock:
+        if registration.inliers and status is FrameStatus.TRACKING and len(samples) and gapless and p.imu.learn_clock:
             clock = clock.learnt(samples, predicted.state, posterior.state)
         if not waiting:
             self._insert(posterior, sampled.points, float(np.nan_to_num(registration.residual_rms)))

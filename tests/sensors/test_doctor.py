@@ -55,7 +55,6 @@ def test_outages_steps_back_and_missing_scans_are_counted(tmp_path: Path) -> Non
     assert found["IMU gaps"].verdict == "needs you" and "the longest 0.400 s" in found["IMU gaps"].text
     assert found["IMU time"].verdict == "corrected" and "1 steps back" in found["IMU time"].text
     assert "2 missing" in found["scan time"].text and "0.300 s" in found["scan time"].text
-    assert "gap of the IMU" in found["pairing"].text
 
 
 def test_the_share_of_nan_is_reported(tmp_path: Path) -> None:
