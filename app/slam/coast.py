@@ -1,8 +1,11 @@
-"""The motion by the LiDAR alone: between two scans the device turns and moves on as fast as it did.
+"""The update where the prediction does not tell the motion during a scan: there is no IMU, it has a gap, or the speed
+is not known yet.
 
 Each point is compared with the map where the device was at the point's own time, so a scan determines rates and not
-only a pose (continuous-time ICP, Dellenbach et al. 2022, "CT-ICP"). The state holds the rate of turn as the bias of a
-gyroscope that reads zero. Gravity is the normal of the floor where one is seen.
+only a pose (continuous-time ICP, Dellenbach et al. 2022, "CT-ICP").
+
+Without an IMU the device turns and moves on between two scans as fast as it did. The state then holds the rate of turn
+as the bias of a gyroscope that reads zero, and gravity is the normal of the floor where one is seen.
 """
 
 from dataclasses import dataclass, replace
@@ -10,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import ground, iekf, lie
-from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief
+from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief, Path
 from app.slam.kernels import motion
 from app.slam.kernels.registration import EDGE_ON, REPEATED, RESIDUAL_HUBER
 from app.slam.local_map import LocalMap
@@ -31,8 +34,9 @@ GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
 """Of the residuals in each iteration, times the filter's gate; wide at first, since nothing measures the motion."""
 CONVERGED_ROTATION, CONVERGED_TRANSLATION = 1e-4, 1e-3
 """rad, m: an increment below these ends the iteration."""
-FREE = slice(0, 12)
-"""Error dimensions that a scan corrects: rotation, position, velocity and rate of turn."""
+UNSURE = 0.2
+"""m/s: standard deviation of the speed from which it is better found from the scan's own distortion than taken from the
+prediction: points are then off by over 1 cm."""
 UPRIGHT = np.array([[0.0, 0.0, 1.0]])
 FORWARD = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
 """What may be up in the LiDAR frame: of a scanner held upright, and of a hemispherical one that looks forward."""
@@ -67,6 +71,14 @@ class Course:
         times = np.append(-dt, times) if scan < dt else times
         nothing = np.zeros((len(times), 3))
         return cls(times, np.tile(np.eye(3), (len(times), 1, 1)), nothing, nothing)
+
+    @classmethod
+    def measured(cls, path: Path, predicted: NavState) -> "Course":
+        """What the IMU measured along the path, which led to the predicted state."""
+        R, t = predicted.R_odom_imu, path.times[:, None]
+        turned = R.T @ path.poses[:, :, :3] @ lie.exp(predicted.b_gyro * t)
+        swayed = (path.poses[:, :, 3] - predicted.p_odom_imu - predicted.v_odom_imu * t) @ R
+        return cls(path.times, turned, swayed, np.zeros_like(swayed))
 
 
 def begin(scan: Scan, params: Params) -> Belief:
@@ -121,6 +133,11 @@ def propagate(belief: Belief, end_ns: int, course: Course, changes: tuple[float,
     return Belief(moved, F @ belief.covariance @ F.T + Q)
 
 
+def is_unsure(belief: Belief) -> bool:
+    """Whether the speed is too uncertain to deskew a scan by it."""
+    return bool(np.linalg.eigvalsh(belief.covariance[VEL, VEL])[-1] > UNSURE**2)
+
+
 def is_adrift(belief: Belief) -> bool:
     """Whether nothing measures the speed in some direction any more, so that the position along it is a guess."""
     return bool(np.linalg.eigvalsh(belief.covariance[VEL, VEL])[-1] > ADRIFT**2)
@@ -139,18 +156,20 @@ def deskew(scan: Scan, state: NavState, course: Course) -> F32:
 
 
 def update(
-    prior: Belief, scan: Scan, course: Course, local_map: LocalMap, params: FilterParams
+    prior: Belief, scan: Scan, course: Course, local_map: LocalMap, params: FilterParams, extrinsics: bool = False
 ) -> tuple[Belief, Registration]:
     """Correct pose and rates by one scan: iterated least squares from the prior, as `iekf.update`.
 
     Args:
         scan: points as measured; at most `max_points` of them are looked up in the map.
+        extrinsics: whether to refine the LiDAR's pose on the IMU, too.
     """
     scan = scan.part(np.arange(0, len(scan), -(-len(scan) // params.max_points) or 1))
     ago = ((scan.stamp_ns - prior.state.stamp_ns + scan.offsets_ns.astype(np.int64)) * 1e-9)[:, None]  # <= 0
-    information, here = np.linalg.inv(prior.covariance[FREE, FREE]), prior.state
+    free = DIM if extrinsics else iekf.NAVIGATION
+    information, here = np.asarray(np.linalg.inv(prior.covariance[:free, :free])), prior.state
     enough = iekf.enough_planes(len(scan), float(np.linalg.norm(here.v_odom_imu)))
-    converged, iteration, covariance = False, 0, prior.covariance.copy()
+    converged, iteration, covariance = False, 0, information
     for iteration, gate in enumerate(GATES, 1):
         points = deskew(scan, here, course)
         arms = points @ here.R_imu_lidar.T + here.p_imu_lidar
@@ -170,20 +189,24 @@ def update(
         if len(used) < iekf.MIN_INLIERS:
             return prior, iekf.too_few(iteration, len(scan), len(used), iekf.matches(points, residuals, planes))
         turn, way = np.cross(arms[used], normals[fits]), at[fits]
-        rows = np.hstack([turn, way, ago[used] * way, -ago[used] * turn])
+        rows = np.zeros((len(used), DIM))
+        rows[:, ROT], rows[:, POS], rows[:, VEL], rows[:, BG] = turn, way, ago[used] * way, -ago[used] * turn
+        rows[:, EXT_ROT] = np.cross(points[used], normals[fits] @ here.R_imu_lidar)
+        rows[:, EXT_POS] = normals[fits]
+        rows = rows[:, :free]
         weighted = rows.T * (np.minimum(1.0, RESIDUAL_HUBER * spread / np.maximum(np.abs(off), 1e-9)) / spread**2)
         H = weighted @ rows / REPEATED
-        gradient = weighted @ off / REPEATED + information @ iekf.boxminus(here, prior.state)[FREE]
-        covariance[FREE, FREE] = np.linalg.inv(information + H)
+        gradient = weighted @ off / REPEATED + information @ iekf.boxminus(here, prior.state)[:free]
+        covariance = np.asarray(np.linalg.inv(information + H))
         step = np.zeros(DIM)
-        step[FREE] = -covariance[FREE, FREE] @ gradient
+        step[:free] = -covariance @ gradient
         here = iekf.boxplus(here, step)
         small = np.linalg.norm(step[ROT]) < CONVERGED_ROTATION and np.linalg.norm(step[POS]) < CONVERGED_TRANSLATION
         if gate == 1.0 and small:
             converged = True
             break
     registration = iekf.outcome(points, H[:6, :6], converged, iteration, stats, iekf.matches(points, residuals, planes))
-    return Belief(here, covariance), registration
+    return Belief(here, iekf.schmidt(prior.covariance, information, covariance)), registration
 
 
 def _up(scan: Scan, params: Params) -> F64:

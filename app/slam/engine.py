@@ -93,7 +93,7 @@ class Engine:
             scan = channels.bent(scan, -lines.errors[:, 1], -lines.errors[:, 0])
         clock = before.clock if p.imu.learn_clock else ClockOffset()
         samples = clock.set_right(samples)
-        gap_s = float(np.diff(samples.stamps_ns).max(initial=0)) * 1e-9
+        gap_s = imu.longest_gap(samples, end_ns)
         gapless = gap_s <= p.imu.max_gap
 
         belief, still, waiting = before.belief, before.still, False
@@ -105,10 +105,12 @@ class Engine:
             belief, still, waiting = started.belief, started.still, started.waiting
             notices += [started.notice] if started.notice else []
         if len(samples):
-            predicted, path = imu.propagate(belief, samples, end_ns, p.imu, clock.sigma)
+            before_scan = belief if gapless else imu.before_gap(belief)
+            predicted, path = imu.propagate(before_scan, samples, end_ns, p.imu, clock.sigma)
             predicted = rest.hold(predicted, samples) if gapless else predicted
             watch.lap("propagate")
             points = imu.deskew(scan, path, predicted.state)
+            course = coast.Course.measured(path, predicted.state) if not gapless or coast.is_unsure(predicted) else None
         else:
             course = coast.Course.steady(belief.state.stamp_ns, end_ns)
             predicted = coast.propagate(belief, end_ns, course)
@@ -127,21 +129,22 @@ class Engine:
         # paper 2.3, eq. 5-7
         posterior, registration, adrift = predicted, _NOT_REGISTERED, False
         if self._map.voxels:
-            if len(samples):
+            if course is None:
                 chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-                fuse = partial(iekf.update, predicted, chosen, gapless=gapless)
+                fuse = partial(iekf.update, predicted, chosen)
                 posterior, registration = self._update(belief, predicted, fuse)
             else:  # the points themselves, since centroids have no time
-                source = reduced.source[sampled.source]
-                fuse = partial(coast.update, predicted, scan.part(source), course)
+                source, refines = reduced.source[sampled.source], p.filter.estimate_extrinsics and gapless
+                fuse = partial(coast.update, predicted, scan.part(source), course, extrinsics=refines)
                 posterior, registration = self._update(belief, predicted, fuse)
-                # the prediction was no measurement that the scan could contradict
-                registration = replace(registration, predicted_change=np.nan, correction=np.nan)
-                if registration.degenerate and coast.is_adrift(posterior):
-                    adrift = True
-                    registration = replace(registration, reason=f"{registration.reason}, and there is no IMU")
                 points = coast.deskew(scan, posterior.state, course)
                 sampled = replace(sampled, points=points[source])
+                # the prediction was no measurement that the scan could contradict
+                registration = replace(registration, predicted_change=np.nan, correction=np.nan)
+                if not len(samples) and registration.degenerate and coast.is_adrift(posterior):
+                    adrift = True
+                    registration = replace(registration, reason=f"{registration.reason}, and there is no IMU")
+        posterior = posterior if gapless else imu.after_gap(posterior, belief)
         status = FrameStatus.LOST if adrift else _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 

@@ -68,24 +68,19 @@ def enough_planes(points: int, speed: float) -> float:
     return max(ENOUGH_PLANES, ENOUGH_SHARE * points) if speed > WALKING else ENOUGH_PLANES
 
 
-def update(
-    prior: Belief, points: F32, local_map: LocalMap, params: FilterParams, gapless: bool = True
-) -> tuple[Belief, Registration]:
+def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams) -> tuple[Belief, Registration]:
     """Fuse one scan: minimise eq. 7 from the predicted belief.
 
     Args:
         prior: belief at the scan's end, from propagation.
         points: (n, 3) float32 m, LiDAR frame, deskewed to the scan's end.
-        gapless: whether the IMU saw the whole motion. If not, points are not where deskewing puts them, and the
-            extrinsics stay as they are.
 
     Returns:
         The posterior belief, or the unchanged prior if too few points found a plane; and how the update went.
     """
     n = len(points)
-    extrinsics = params.estimate_extrinsics and gapless
-    free = DIM if extrinsics else NAVIGATION
-    information = np.linalg.inv(prior.covariance[:free, :free])
+    free = DIM if params.estimate_extrinsics else NAVIGATION
+    information = np.asarray(np.linalg.inv(prior.covariance[:free, :free]))
     world, residuals = np.empty((n, 3)), np.empty(n)
     H, b, stats = np.empty((12, 12)), np.empty(12), np.zeros(2)
     begin = x = _packed(prior.state)
@@ -105,7 +100,7 @@ def update(
             since_search[:] = 0.0
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
-            planes.deviations, params.gate, extrinsics, H, b, stats, residuals,
+            planes.deviations, params.gate, params.estimate_extrinsics, H, b, stats, residuals,
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
@@ -123,12 +118,22 @@ def update(
     correction = correction[:free]
     surprise = correction @ information @ correction / (free - np.trace(information @ covariance))
     found = outcome(points, H[:6, :6], converged, iteration, stats, matches(points, residuals, planes))
-    posterior = prior.covariance.copy()
-    posterior[:free, :free] = covariance
-    # states that are not estimated keep their variance, and their correlations shrink with the rest (Schmidt 1966)
-    posterior[:free, free:] = covariance @ information @ prior.covariance[:free, free:]
-    posterior[free:, :free] = posterior[:free, free:].T
+    posterior = schmidt(prior.covariance, information, covariance)
     return Belief(_unpacked(x, prior.state.stamp_ns), posterior), replace(found, surprise=float(surprise))
+
+
+def schmidt(prior: F64, information: F64, covariance: F64) -> F64:
+    """The covariance (23, 23) after an update of the first states only; the others keep their variance, and their
+    correlations shrink (Schmidt 1966).
+
+    Args:
+        information, covariance: (k, k) of these states, before and after the update.
+    """
+    free, posterior = len(covariance), prior.copy()
+    posterior[:free, :free] = covariance
+    posterior[:free, free:] = covariance @ information @ prior[:free, free:]
+    posterior[free:, :free] = posterior[:free, free:].T
+    return posterior
 
 
 def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:

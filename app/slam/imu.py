@@ -24,8 +24,9 @@ LONG_GAP = 0.4
 """s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
 GYRO_SCALE = 0.006
 """Possible error of the gyroscope's turns, as a share: of scale and between its axes."""
-GAP_NOISE = (0.5, 3.0)
-"""Noise densities (rad/s/√Hz, m/s²/√Hz) for bridging a gap: those of walking and turning."""
+GAP_RATE, GAP_NOISE = 1.0, 1.0
+"""rad/s, m/s²/√Hz: in a gap, standard deviation of the rate of turn and noise density of the acceleration; those of a
+walking person's hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,8 @@ def propagate(
     """Carry the belief forward to `end_ns` through the samples that cover the time from its stamp.
 
     Rates are linear between samples, and constant before the first and after the last one. Through a long gap the
-    velocity is constant. clock_sigma: s, how well the offset of the IMU's clock is known.
+    velocity is constant, and once the samples end, the device does not turn either. clock_sigma: s, how well the offset
+    of the IMU's clock is known.
 
     Returns the predicted belief and the path in between.
     """
@@ -75,10 +77,10 @@ def propagate(
     if end_ns <= state.stamp_ns:  # nothing to integrate
         here = state.T_odom_imu[None, :3]
         return belief, Path(np.array([-1.0, 0.0]), np.concatenate([here, here]))
-    times, gyro, accel, spacing = _clipped(imu, state.stamp_ns, end_ns)
+    times, gyro, accel, spacing = _clipped(imu, state.stamp_ns, end_ns, state.b_gyro)
     R, p, v = state.R_odom_imu.copy(), state.p_odom_imu.copy(), state.v_odom_imu.copy()
     P = belief.covariance.copy()
-    noise = np.array([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk, *GAP_NOISE])
+    noise = np.array([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk, GAP_NOISE])
     noise[:2] = np.hypot(noise[:2], _unsteady(times, gyro - state.b_gyro, accel, clock_sigma, _turn_error(belief)))
     knots = int(np.sum(np.ceil(np.maximum(np.diff(times), 0) / MAX_KNOT_STEP))) + 2 * len(times)
     knot_t, knot_T = np.empty(knots), np.empty((knots, 3, 4))
@@ -116,6 +118,26 @@ def _unsteady(times: F64, rates: F64, forces: F64, clock_sigma: float, turn_erro
     return np.hypot(clock_sigma * np.array(jerked), [turn_error * turn * np.sqrt(lasting), 0.0])
 
 
+def longest_gap(imu: ImuSamples, end_ns: int) -> float:
+    """s, the longest time without a sample, up to `end_ns`; 0 without any samples."""
+    return float(np.diff(np.append(imu.stamps_ns, end_ns)).max(initial=0)) * 1e-9 if len(imu) else 0.0
+
+
+def before_gap(belief: Belief) -> Belief:
+    """The belief at the begin of a scan with a gap: what the gyroscope would have read is open, as if its bias were."""
+    covariance = belief.covariance.copy()
+    covariance[BG, BG] += GAP_RATE**2 * np.eye(3)
+    return replace(belief, covariance=covariance)
+
+
+def after_gap(belief: Belief, before: Belief) -> Belief:
+    """The belief at the end of such a scan, with the gyroscope's bias as it was known `before`."""
+    covariance = belief.covariance.copy()
+    covariance[BG] = covariance[:, BG] = 0.0
+    covariance[BG, BG] = before.covariance[BG, BG]
+    return Belief(replace(belief.state, b_gyro=before.state.b_gyro), covariance)
+
+
 def deskew(scan: Scan, path: Path, state: NavState) -> F32:
     """Every point in the LiDAR frame at the path's end, the time of `state`.
 
@@ -134,8 +156,9 @@ def deskew(scan: Scan, path: Path, state: NavState) -> F32:
     return out
 
 
-def _clipped(imu: ImuSamples, begin_ns: int, end_ns: int) -> tuple[F64, F64, F64, F64]:
-    """Samples from begin to end (s after begin), with values interpolated at both ends.
+def _clipped(imu: ImuSamples, begin_ns: int, end_ns: int, b_gyro: F64) -> tuple[F64, F64, F64, F64]:
+    """Samples from begin to end (s after begin), with values interpolated at both ends; b_gyro (3,) is the gyroscope's
+    reading of a device that does not turn.
 
     The last value (k - 1,) is, for each interval, the time in s between the samples around it, so that a gap
     stays one gap however many scans end inside it.
@@ -144,7 +167,8 @@ def _clipped(imu: ImuSamples, begin_ns: int, end_ns: int) -> tuple[F64, F64, F64
     stamps = np.concatenate([[begin_ns], imu.stamps_ns[inside], [end_ns]])
     at = (stamps - begin_ns) * 1e-9
     have = (imu.stamps_ns - begin_ns) * 1e-9
-    gyro = np.stack([np.interp(at, have, imu.gyro[:, i]) for i in range(3)], axis=1)
+    afterwards = b_gyro if at[-1] - have[-1] > LONG_GAP else imu.gyro[-1]
+    gyro = np.stack([np.interp(at, have, imu.gyro[:, i], right=afterwards[i]) for i in range(3)], axis=1)
     accel = np.stack([np.interp(at, have, imu.accel[:, i]) for i in range(3)], axis=1)
     known = np.concatenate([[min(have[0], at[0])], have, [max(have[-1], at[-1])]])
     after = np.searchsorted(known, 0.5 * (at[1:] + at[:-1]))

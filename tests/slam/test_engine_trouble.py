@@ -105,11 +105,12 @@ def without_imu(walk: Iterable[Measurement], begin_s: float, end_s: float) -> li
     return paired
 
 
-@pytest.mark.parametrize("seconds", [0.15, 0.5, 2.0])
+@pytest.mark.parametrize("seconds", [0.15, 0.5, 2.0, 60.0])
 def test_a_gap_in_the_imu_is_bridged_by_the_scans(seconds: float) -> None:
+    """Also one that never ends."""
     results = run(Engine(params_for(REAL)), without_imu(room_walk(80), 4.02, 4.02 + seconds))
-    metres, degrees = worst(results, Walk(), since=65)
-    assert metres < 0.05
+    metres, degrees = worst(results, Walk(), since=41)
+    assert metres < 0.03
     assert degrees < 0.7
     assert results[-1].status is FrameStatus.TRACKING
 

@@ -8,26 +8,31 @@ from app.slam.local_map import LocalMap
 from app.slam.sections import MapParams
 from app.slam.types import NavState
 
-from .scenes import START_NS, Rig, Scene, Walk, mounted, sweep
+from .scenes import GRAVITY, START_NS, Rig, Scene, Walk, mounted, sweep
 
 SIDEWAYS = mounted((90, 10, -30), (0.1, -0.2, 0.15))
 RIG = Rig(columns=60, T_imu_lidar=SIDEWAYS, range_noise=0.003)
 STANDING = Walk(still=1e9)
 
 
-def truth(rig: Rig = RIG) -> NavState:
-    pose = STANDING.pose(0.0)
+def state_at(walk: Walk, t: float, rig: Rig | None = None) -> NavState:
+    """The truth as a filter's state; odom is the scene's world."""
+    rig = rig or Rig()
     return NavState(
-        stamp_ns=START_NS,
-        R_odom_imu=pose[:3, :3].copy(),
-        p_odom_imu=pose[:3, 3].copy(),
-        v_odom_imu=np.zeros(3),
-        b_gyro=np.zeros(3),
-        b_accel=np.zeros(3),
-        g_odom=np.array([0.0, 0.0, -9.81]),
+        stamp_ns=START_NS + round(t * 1e9),
+        R_odom_imu=walk.pose(t)[:3, :3].copy(),
+        p_odom_imu=walk.pose(t)[:3, 3].copy(),
+        v_odom_imu=walk.velocities(np.array([t]))[0],
+        b_gyro=np.array(rig.b_gyro),
+        b_accel=np.array(rig.b_accel),
+        g_odom=np.array([0.0, 0.0, -GRAVITY]),
         R_imu_lidar=rig.T_imu_lidar[:3, :3].copy(),
         p_imu_lidar=rig.T_imu_lidar[:3, 3].copy(),
     )
+
+
+def truth(rig: Rig = RIG) -> NavState:
+    return state_at(STANDING, 0.0, rig)
 
 
 def surveyed(scene: Scene) -> LocalMap:

@@ -13,9 +13,9 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
     """Integrate the kinematics from times[0] to times[-1]; R, p, v and P are updated in place.
 
     times (k,) s ascending; gyro (k, 3) rad/s and accel (k, 3) m/s² at those times, linear in between; bg, ba, g (3,):
-    biases and gravity; B (3, 2): tangent basis of gravity. noise (6,): densities of gyro, accel, gyro bias, accel bias,
-    and of gyro and accel in intervals that are `bridged` (k - 1,) bool. In intervals that are `coasting` (k - 1,) bool
-    the velocity is constant. In and out: R (3, 3), p (3,) m, v (3,) m/s, P (23, 23) in the order of `app.slam.imu`.
+    biases and gravity; B (3, 2): tangent basis of gravity. noise (5,): densities of gyro, accel, gyro bias, accel bias,
+    and of accel in intervals that are `bridged` (k - 1,) bool. In intervals that are `coasting` (k - 1,) bool the
+    velocity is constant. In and out: R (3, 3), p (3,) m, v (3,) m/s, P (23, 23) in the order of `app.slam.imu`.
     Out: knots, times knot_t (m,) s and poses knot_T (m, 3, 4), at most `max_step` s apart. Returns their number.
     """
     d = P.shape[0]
@@ -62,9 +62,7 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
                 F[6 + i, 15 + j] = aw[i] * dt
         P[:9] = F @ P
         P[:, :9] = P @ F.T
-        ng, na = noise[0], noise[1]
-        if bridged[s]:
-            ng, na = noise[4], noise[5]
+        ng, na = noise[0], noise[4] if bridged[s] else noise[1]
         for i in range(3):
             P[i, i] += ng * ng * dt
             P[6 + i, 6 + i] += na * na * dt
