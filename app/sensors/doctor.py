@@ -73,7 +73,7 @@ def examine(
             _rate("scan rate", scans[:, 1], 4.0),
             *(of_imu if recording.imu_topic else ()),
             *_scan_time(scans),
-            _pairing(counts.paired, census.reasons, recording.imu_topic),
+            _pairing(counts.paired, census.reasons),
             _returns(census, len(scans)),
         )
 
@@ -200,12 +200,10 @@ def _scan_time(scans: I64) -> list[Finding]:
     return [Finding("scan time", "corrected" if wrong else "fine", text)]
 
 
-def _pairing(paired: int, reasons: Counter[str], imu_topic: str) -> Finding:
+def _pairing(paired: int, reasons: Counter[str]) -> Finding:
     dropped = reasons.total()
     if not dropped:
-        return Finding(
-            "pairing", "fine", f"all {paired} scans " + ("are covered by IMU samples" if imu_topic else "can be used")
-        )
+        return Finding("pairing", "fine", f"all {paired} scans can be used")
     why = ", ".join(f"{count} because {reason}" for reason, count in reasons.most_common(3))
     verdict: FindingVerdict = "corrected" if dropped < 0.1 * (dropped + paired) else "needs you"
     return Finding("pairing", verdict, f"{paired} scans can be used, {dropped} are left out: {why}")

@@ -2,7 +2,8 @@
 
 A recording and a live source use it alike: they call `add_imu`, `add_scan` and `add` in the order of arrival, and
 `ready()` gives what is complete. Pairing goes by the time of measurement, never by arrival. Gaps, repeated samples and
-steps back in time are detected, counted and reported.
+steps back in time are detected, counted and reported. A scan without samples is used all the same once the IMU has
+covered an earlier one: then the LiDAR alone shows the motion.
 """
 
 import bisect
@@ -15,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from app.slam.sections import ImuParams
-from app.slam.types import DroppedScan, ImuSamples, Measurement, Samples, Scan, Vector
+from app.slam.types import I64, DroppedScan, ImuSamples, Measurement, Samples, Scan, Vector
 
 OUTAGE_NS = 1_000_000_000
 """A sample that comes more than this after the one before must be confirmed by the next."""
 
 MAX_WAITING = 64
-"""Scans that may wait for IMU samples; bounds the memory when the IMU falls silent."""
+"""Scans that wait for IMU samples at most; bounds the memory when the IMU falls silent."""
 
 MAX_SAMPLES = 100_000
 """IMU samples that may wait for a scan, eight minutes at 200 Hz: nobody dead-reckons longer than that."""
@@ -54,7 +55,7 @@ class Counts:
 
 @dataclass(slots=True)
 class Sequencer:
-    """The one place that guarantees IMU coverage of a scan, by samples that an IMU can have measured.
+    """The one place that gives a scan the IMU samples that cover it, and only those that an IMU can have measured.
 
     Attributes:
         limits: `max_gap`: a longer interval between IMU samples is a gap, and reported. `max_rate`,
@@ -75,6 +76,9 @@ class Sequencer:
     _last_end_ns: int | None = None
     _intervals_ns: list[int] = field(default_factory=list)
     _behind: bool = False
+    _told_gap_ns: int = -1
+    _told_silence_ns: int = -1
+    """Last sample before the gap, and before the silence without an end, that was told last."""
     _suspect: tuple[int, tuple[float, ...]] | None = None
     """A sample stamped far ahead of the one before: a wrong stamp, unless the next one goes on from there."""
     _usual: list[float] = field(default_factory=lambda: [0.0, 0.0])
@@ -135,10 +139,8 @@ class Sequencer:
         return self._suspect is not None and 0 < stamp_ns - self._suspect[0] <= OUTAGE_NS
 
     def _append(self, stamp_ns: int, values: tuple[float, ...]) -> None:
-        gap_s = (stamp_ns - self._stamps[-1]) / 1e9 if self._stamps else 0.0
-        if gap_s > self.limits.max_gap:
-            self.counts.imu_gaps += 1
-            self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
+        if self._stamps:
+            self._count_gap(self._stamps[-1], stamp_ns)
         self._note_stuck_axes(values)
         self._stamps.append(stamp_ns)
         self._values.append(values)
@@ -150,6 +152,12 @@ class Sequencer:
             if not self._begun and len(self._values) > 2:  # the very first has neighbours on one side only
                 self._begun = True
                 self._check(-2, -3, -1)
+
+    def _count_gap(self, before_ns: int, after_ns: int) -> None:
+        gap_s = (after_ns - before_ns) / 1e9
+        if gap_s > self.limits.max_gap:
+            self.counts.imu_gaps += 1
+            self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
 
     def _note_stuck_axes(self, values: tuple[float, ...]) -> None:
         """An axis with noise never reads the same number for long."""
@@ -191,26 +199,41 @@ class Sequencer:
         bisect.insort(self._waiting, scan, key=lambda waiting: waiting.stamp_ns)
 
     @property
+    def waiting(self) -> int:
+        """How many scans wait for IMU samples."""
+        return len(self._waiting)
+
+    @property
+    def newest_imu_ns(self) -> int | None:
+        """Time of the newest IMU sample that was accepted; None before the first."""
+        return self._stamps[-1] if self._stamps else None
+
+    @property
     def silent_s(self) -> float:
         """For how long there have been IMU samples and no scan."""
         return (self._stamps[-1] - self._last_end_ns) / 1e9 if self._stamps and self._last_end_ns is not None else 0.0
 
-    def ready(self) -> Iterator[Measurement | DroppedScan]:
-        """What the samples so far complete, in order of time."""
+    def ready(self, most_waiting: int = MAX_WAITING) -> Iterator[Measurement | DroppedScan]:
+        """What the samples so far complete, in order of time.
+
+        Args:
+            most_waiting: scans that may wait for samples; of more, the oldest go out without. At least 1 while scans
+                come, since a later one may arrive first.
+        """
+        most = min(most_waiting, 1) if self.without_imu else most_waiting
         while self._waiting:
             scan = self._waiting[0]
             end_ns = scan.end_ns if isinstance(scan, Scan) else scan.stamp_ns
             covered = len(self._stamps) > 1 and self._stamps[-2] >= end_ns  # the newest may be a spike
-            covered = covered or (self.without_imu and len(self._waiting) > 1)  # the next may have come too early
-            if not covered and len(self._waiting) <= MAX_WAITING:
+            if not covered and len(self._waiting) <= most:
                 return
             yield self._take(self._waiting.pop(0))
 
     def finish(self) -> Iterator[Measurement | DroppedScan]:
-        """The input is over: what still waits, mostly as dropped scans."""
-        yield from self.ready()
-        while self._waiting:
-            yield self._take(self._waiting.pop(0))
+        """The input is over: what still waits."""
+        yield from self.ready(0)
+        if self._stamps and self._last_end_ns is not None:
+            self._count_gap(self._stamps[-1], self._last_end_ns)
 
     def _take(self, scan: Scan | DroppedScan) -> Measurement | DroppedScan:
         reason = scan.reason if isinstance(scan, DroppedScan) else self._objection(scan)
@@ -224,8 +247,7 @@ class Sequencer:
         if scan.refused:
             self._notices.append("points beyond 10 km or without a time were left out")
         imu = self._samples(first, last + 1)
-        gaps = np.diff(imu.stamps_ns)[imu.stamps_ns[:-1] >= begin_ns] / 1e9  # earlier ones came with the scan before
-        self._notices += [f"no IMU sample for {gap:.3f} s" for gap in gaps[gaps > self.limits.max_gap]]
+        self._tell_gaps(imu.stamps_ns, end_ns)
         measurement = Measurement(scan, imu, tuple(self._notices), self._take_streams(end_ns))
         self._notices.clear()
         self._last_stamp_ns, self._last_end_ns = scan.stamp_ns, end_ns
@@ -257,9 +279,23 @@ class Sequencer:
             return "there is no IMU sample"
         if begin_ns < self._stamps[0]:
             return "the IMU starts after it"
-        if end_ns > self._stamps[-1]:
+        if end_ns > self._stamps[-1] and self._last_end_ns is None:
             return "the IMU stops before its end"
         return ""
+
+    def _tell_gaps(self, stamps_ns: I64, end_ns: int) -> None:
+        """Each gap is told once, with the first scan that knows its end."""
+        if self.without_imu:
+            return
+        gaps = np.diff(stamps_ns) > self.limits.max_gap * 1e9
+        for before, after in zip(stamps_ns[:-1][gaps].tolist(), stamps_ns[1:][gaps].tolist(), strict=True):
+            if before > self._told_gap_ns:
+                self._notices.append(f"no IMU sample for {(after - before) / 1e9:.3f} s")
+                self._told_gap_ns = before
+        newest = int(stamps_ns[-1])
+        if end_ns - newest > self.limits.max_gap * 1e9 and newest > self._told_silence_ns:
+            self._notices.append("the IMU has fallen silent: until it is back, the LiDAR alone shows the motion")
+            self._told_silence_ns = newest
 
     def _note_missing_scans(self, scan: Scan) -> None:
         if self._last_stamp_ns is None:

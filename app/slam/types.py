@@ -106,9 +106,10 @@ class Measurement:
 
     `imu` runs from the last sample at or before the previous scan's end (for the first scan: from
     the first sample there is) to the first sample at or after this scan's end, so that both ends
-    can be interpolated. `notices` says what was wrong with their times (gaps, back-steps).
-    `streams` holds the samples of other sensors (satellite fixes, wheel odometry, images) by their
-    type: those up to this scan's end that no earlier measurement holds, in order of time.
+    can be interpolated. While the IMU is silent it ends earlier, with the last sample there is.
+    `notices` says what was wrong with their times (gaps, back-steps). `streams` holds the samples
+    of other sensors (satellite fixes, wheel odometry, images) by their type: those up to this
+    scan's end that no earlier measurement holds, in order of time.
     """
 
     scan: Scan

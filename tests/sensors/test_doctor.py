@@ -57,6 +57,12 @@ def test_outages_steps_back_and_missing_scans_are_counted(tmp_path: Path) -> Non
     assert "2 missing" in found["scan time"].text and "0.300 s" in found["scan time"].text
 
 
+def test_an_imu_that_stops_for_good_is_a_gap_to_the_end(tmp_path: Path) -> None:
+    found = by_subject(rig.write(tmp_path / "walk", rig.walk(turns=20, columns=4, imu_stop_ns=1_000_000_000)))
+    assert found["IMU gaps"].verdict == "needs you" and "1 longer than 0.1 s" in found["IMU gaps"].text
+    assert found["pairing"].text == "all 20 scans can be used"
+
+
 def test_the_share_of_nan_is_reported(tmp_path: Path) -> None:
     entries = []
     for topic, log, sent in rig.walk(turns=4, columns=10):

@@ -1,4 +1,4 @@
-"""A scan is given with the IMU samples that cover it, or dropped with the reason; nothing good is lost."""
+"""A scan is given with the IMU samples that cover it, as far as there are any; nothing good is lost."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -97,8 +97,8 @@ def test_the_pairs_do_not_depend_on_delays_of_arrival(delays: list[int], imu_del
 
 @settings(deadline=None)
 @given(st.lists(st.integers(0, 3000), min_size=2, max_size=80), st.lists(st.integers(0, 3000), max_size=15))
-def test_every_measurement_is_covered_and_in_order_for_any_input(imu: list[int], begins: list[int]) -> None:
-    out, _ = feed(imu, [scan(begin) for begin in begins])
+def test_every_measurement_is_in_order_and_covered_up_to_the_last_sample(imu: list[int], begins: list[int]) -> None:
+    out, sequencer = feed(imu, [scan(begin) for begin in begins])
     assert len(out) == len(begins)
     previous_end = None
     for entry in out:
@@ -107,11 +107,12 @@ def test_every_measurement_is_covered_and_in_order_for_any_input(imu: list[int],
             continue
         times = entry.imu.stamps_ns
         assert (np.diff(times) > 0).all()
-        assert times[0] <= entry.scan.stamp_ns and times[-1] >= entry.scan.end_ns
-        assert times[-2] < entry.scan.end_ns
+        assert times[0] <= entry.scan.stamp_ns
+        assert times[-1] >= entry.scan.end_ns or times[-1] == sequencer.newest_imu_ns
+        assert (times[:-1] < entry.scan.end_ns).all()
         if previous_end is not None:
             assert entry.scan.end_ns > previous_end
-            assert times[0] <= previous_end < times[1]
+            assert times[0] <= previous_end and (times[1:] > previous_end).all()
         previous_end = entry.scan.end_ns
 
 
@@ -125,10 +126,55 @@ def test_scans_before_a_late_imu_are_dropped_and_the_rest_is_kept() -> None:
     assert stamps(out[3]) == samples(250, 400)
 
 
-def test_scans_after_the_imu_stopped_are_dropped_with_the_reason() -> None:
-    out, _ = feed(samples(0, 350), [scan(100 * n) for n in range(6)])
-    assert [at for at, _ in dropped(out)] == [300, 400, 500]
-    assert {why for _, why in dropped(out)} == {"the IMU stops before its end"}
+def told(entries: Sequence[Measurement | DroppedScan]) -> dict[int, tuple[str, ...]]:
+    """What is noted, by the begin of the scan in ms."""
+    used = [entry for entry in entries if isinstance(entry, Measurement)]
+    return {entry.scan.stamp_ns // MS: entry.notices for entry in used if entry.notices}
+
+
+def test_scans_after_the_imu_stopped_are_used_and_it_is_told_once() -> None:
+    out, sequencer = feed(samples(0, 350), [scan(100 * n) for n in range(9)])
+    assert dropped(out) == []
+    assert [stamps(entry) for entry in out[3:]] == [samples(300, 350), *[[350]] * 5]
+    assert told(out) == {400: ("the IMU has fallen silent: until it is back, the LiDAR alone shows the motion",)}
+    assert (sequencer.counts.imu_gaps, sequencer.counts.longest_imu_gap_s) == (1, 0.55)
+
+
+def test_scans_are_used_through_a_gap_of_any_length_and_its_length_is_told_at_its_end() -> None:
+    out, sequencer = feed([*samples(0, 250), *samples(30_000, 30_400)], [scan(100 * n) for n in range(303)])
+    assert len(out) == 303 and dropped(out) == []
+    first, second = told(out)
+    assert (first, told(out)[second]) == (300, ("no IMU sample for 29.750 s",))
+    assert 0 < 30_000 - second <= 100 * (MAX_WAITING + 1), "told by the first scan that knows"
+    assert stamps(out[100]) == [250] and stamps(out[299]) == [250, 30_000]
+    assert stamps(out[301])[0] == 30_100
+    assert sequencer.counts.imu_gaps == 1
+
+
+def test_one_that_goes_on_from_a_copy_within_a_gap_gives_the_same() -> None:
+    sequencer, out = Sequencer(ImuParams()), []
+    for at in samples(0, 250):
+        push(sequencer, at)
+    for n in range(100):
+        sequencer.add_scan(scan(100 * n))
+        out += sequencer.ready()
+    ends = []
+    for one in (sequencer.copy(), sequencer):
+        for at in samples(10_000, 10_300):
+            push(one, at)
+        one.add_scan(scan(10_000))
+        rest = [*one.ready(), *one.finish()]
+        ends.append(([stamps(entry) for entry in rest], told(rest)))
+    assert ends[0] == ends[1] and len(out) + len(ends[0][0]) == 101
+
+
+def test_more_scans_wait_only_as_long_as_they_may() -> None:
+    sequencer = Sequencer(ImuParams())
+    for arrived in (*samples(0, 110), scan(0), scan(100), scan(200), scan(300)):
+        push(sequencer, arrived)
+    assert len(list(sequencer.ready())) == 1 and sequencer.waiting == 3
+    assert len(list(sequencer.ready(1))) == 2 and sequencer.waiting == 1
+    assert len(list(sequencer.ready(0))) == 1 and sequencer.waiting == 0
 
 
 def test_a_silent_imu_does_not_fill_the_memory() -> None:
@@ -140,7 +186,7 @@ def test_a_silent_imu_does_not_fill_the_memory() -> None:
         sequencer.add_scan(scan(100 * number))
         out += sequencer.ready()
     assert len(out) >= 2 * MAX_WAITING - 1
-    assert isinstance(out[0], Measurement) and all(isinstance(entry, DroppedScan) for entry in out[1:])
+    assert sequencer.waiting == MAX_WAITING and all(isinstance(entry, Measurement) for entry in out)
 
 
 def test_a_silent_lidar_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,65 +352,3 @@ def test_a_sensor_without_scans_does_not_fill_the_memory() -> None:
         push(sequencer, at)
     sequencer.add_scan(scan(0))
     assert fix_times(next(sequencer.ready())) == []  # the oldest were given up
-
-
-# --- values that no IMU measures ---------------------------------------------------------------------
-def swaying(seed: int, count: int = 200) -> F64:
-    """(count, 6) rad/s and m/s^2 at 100 Hz of someone walking fast, with noise and steps of the foot."""
-    rng = np.random.default_rng(seed)
-    at = np.arange(count)[:, None] / 100
-    swing = np.sin(2 * np.pi * rng.uniform(0.5, 4.0, 6) * at + rng.uniform(0, 6, 6)) * [2, 2, 2, 6, 6, 6]
-    return np.asarray(swing + rng.normal(size=(count, 6)) * [0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
-
-
-def given_on(values: F64) -> tuple[list[int], Sequencer]:
-    """The samples, by number, that a scan over all of them is given."""
-    sequencer = Sequencer(ImuParams())
-    for n, row in enumerate(values.tolist()):
-        sequencer.add_imu(n * 10 * MS, tuple(row[:3]), tuple(row[3:]))
-    sequencer.add_scan(scan(10, 10 * len(values) - 40))
-    (only,) = sequencer.ready()
-    assert isinstance(only, Measurement)
-    return (only.imu.stamps_ns // (10 * MS)).tolist(), sequencer
-
-
-@given(st.integers(0, 1000))
-@settings(max_examples=30, deadline=None)
-def test_no_sample_of_a_vigorous_walk_is_refused(seed: int) -> None:
-    kept, sequencer = given_on(swaying(seed))
-    assert kept == list(range(198)) and sequencer.counts.imu_spikes == 0
-
-
-@given(
-    st.integers(0, 1000),
-    st.integers(0, 197),
-    st.integers(0, 5),
-    st.floats(25.0, 1e300) | st.sampled_from([float("nan"), float("inf")]),
-    st.sampled_from([-1, 1]),
-)
-@settings(max_examples=100, deadline=None)
-def test_one_bad_sample_is_left_out_wherever_it_is_and_no_other(
-    seed: int, place: int, axis: int, size: float, sign: int
-) -> None:
-    values = swaying(seed)
-    values[place, axis] = sign * size
-    kept, sequencer = given_on(values)
-    counts = sequencer.counts
-    assert counts.imu_invalid + counts.imu_out_of_range + counts.imu_spikes >= 1
-    assert set(range(198)) - set(kept) <= {place, 0}  # the first may go with its only neighbour
-    assert place not in kept
-
-
-def test_a_shock_that_lasts_is_no_spike() -> None:
-    values = swaying(1)
-    values[100:104, 3] += [20.0, 60.0, 60.0, 20.0]
-    assert given_on(values)[0] == list(range(198))
-
-
-def test_a_refused_sample_is_reported_with_the_measurement() -> None:
-    sequencer = Sequencer(ImuParams(max_acceleration=20.0))
-    for at in samples(0, 200):
-        sequencer.add_imu(at * MS, (0.0, 0.0, 0.0), (0.0, 0.0, 25.0 if at == 50 else 9.81))
-    sequencer.add_scan(scan(0))
-    (only,) = sequencer.ready()
-    assert isinstance(only, Measurement) and "beyond what an IMU can measure" in only.notices[0]

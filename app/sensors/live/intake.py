@@ -278,9 +278,7 @@ class Intake:
     def _bound(self) -> None:
         while len(self._scans) > MAX_BACKLOG:
             oldest = self._scans.popleft()
-            times = self._arrivals["IMU"]
-            silent = not times or time.time_ns() - times[-1] > 500_000_000
-            self._rest.append(DroppedScan(oldest.stamp_ns, NO_IMU if silent else BUSY))
+            self._rest.append(DroppedScan(oldest.stamp_ns, BUSY))
             self.counters.dropped += 1
         while len(self._rest) > MAX_WAITING:
             self._rest.popleft()

@@ -11,12 +11,12 @@ from app.sensors.live.intake import Intake, Receive, Settled
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Kind, LiveState, Status
 from app.sensors.recording import ImuEntry
-from app.sensors.sequencer import Sequencer
+from app.sensors.sequencer import MAX_WAITING, Sequencer
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
 SILENCE_S = 1.0
-"""A sensor that has sent nothing for this time is silent."""
+"""A sensor that has sent nothing for this time is silent. Scans then wait for the IMU only until the next one comes."""
 
 Event = Measurement | DroppedScan | Status
 
@@ -59,7 +59,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         self._sequencer = (before and before.pairing) or Sequencer(params.imu)
         self._stop = threading.Event()
         self._events: deque[Event] = deque()
-        self._pairing = False
+        self._heard_ns, self._heard_at = self._sequencer.newest_imu_ns, time.monotonic()
         self._silent_since: dict[str, float] = {}
         self._watched_at = 0.0
         self._failure_reported = False
@@ -107,7 +107,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
 
     def _gather(self, timeout_s: float) -> None:
         """Pass scans to the sequencer one at a time, so that later ones can still be dropped."""
-        rest, scan = self._intake.take(timeout_s, scan=not self._pairing)
+        rest, scan = self._intake.take(timeout_s, scan=self._sequencer.waiting <= self._imu_is_silent())
         for entry in rest:
             if isinstance(entry, ImuEntry):
                 self._sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
@@ -115,10 +115,13 @@ class LiveSource(AbstractContextManager["LiveSource"]):
                 self._events.append(entry)
         if scan is not None:
             self._sequencer.add_scan(scan)
-            self._pairing = True
-        for paired in self._sequencer.ready():
-            self._pairing = False
-            self._events.append(paired)
+        self._events.extend(self._sequencer.ready(1 if self._imu_is_silent() else MAX_WAITING))
+
+    def _imu_is_silent(self) -> bool:
+        """Whether no sample that the sequencer accepts has come for a while."""
+        if self._heard_ns != self._sequencer.newest_imu_ns:
+            self._heard_ns, self._heard_at = self._sequencer.newest_imu_ns, time.monotonic()
+        return time.monotonic() - self._heard_at > SILENCE_S
 
     def _watch(self) -> None:
         """Report sensors that fell silent or are back, and a recording that failed."""

@@ -168,15 +168,26 @@ def test_acceleration_in_g_is_scaled_and_reported() -> None:
     assert ports.measurements(events)[0].imu.accel[0, 2] == pytest.approx(9.80665, abs=0.05)
 
 
-def test_scans_without_an_imu_and_scans_of_a_busy_engine_have_different_reasons() -> None:
+def test_scans_go_on_without_an_imu_that_dies_and_with_it_when_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.sensors.live.source.SILENCE_S", 0.05)
     rig = Rig()
-    rig.now -= 60 * 10**9
     for _ in range(12):
         rig.turn()
-    rig.events()
-    for _ in range(MAX_BACKLOG + 5):
+    assert scans(rig.events()) == list(range(12))
+    for _ in range(8):
         rig.turn(imu=False)
-    assert {e.reason for e in rig.events() if isinstance(e, DroppedScan)} == {"no IMU sample came to cover it"}
+    assert scans(rig.events()) == [], "it may only be late"
+    time.sleep(0.1)
+    alone = rig.events() + rig.events()
+    assert scans(alone) == list(range(12, 19)), "the last one waits for the next"
+    for _ in range(5):
+        rig.turn()
+    back = rig.events() + rig.events()
+    assert scans(alone + back) in (list(range(12, 25)), list(range(12, 24)))
+    notices = [notice for m in ports.measurements(alone + back) for notice in m.notices]
+    assert sum("fallen silent" in notice for notice in notices) == 1
+    assert sum("no IMU sample for 0.8" in notice for notice in notices) == 1
+    assert not [event for event in alone + back if isinstance(event, DroppedScan)]
 
 
 def test_the_hosts_clock_follows_a_drifting_sensor_by_the_messages_that_did_not_wait() -> None:

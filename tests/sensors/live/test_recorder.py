@@ -56,7 +56,7 @@ def test_a_session_reads_again_as_it_was(tmp_path: Path) -> None:
     recorder.close()
     assert recorder.bytes_written == recorder.path.stat().st_size
     found = scans(recorder.path)
-    assert len(found) == 11  # no sample comes after the last one
+    assert len(found) == 12
     for turn, again in enumerate(found):
         truth = scan(turn)
         np.testing.assert_array_equal(again.points, truth.points)
@@ -176,7 +176,7 @@ def test_a_time_that_ros_has_no_number_for_is_left_out(tmp_path: Path) -> None:
     recorder.add_imu(1 << 61, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), sensor.START_NS)
     recorder.close()
     assert (recorder.failure, recorder.left_out) == ("", 1)
-    assert len(scans(recorder.path)) == 2
+    assert len(scans(recorder.path)) == 3
 
 
 def test_a_disk_that_is_too_slow_costs_scans_of_the_recording_and_no_memory(tmp_path: Path) -> None:

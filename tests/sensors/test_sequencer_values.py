@@ -1,0 +1,74 @@
+"""Values that no IMU measures are left out, wherever they are, and nothing that a person does is.
+
+Tests app/sensors/sequencer.py.
+"""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from app.sensors.sequencer import Sequencer
+from app.slam.sections import ImuParams
+from app.slam.types import F64, Measurement
+from tests.sensors.test_sequencer import MS, samples, scan
+
+
+def swaying(seed: int, count: int = 200) -> F64:
+    """(count, 6) rad/s and m/s^2 at 100 Hz of someone walking fast, with noise and steps of the foot."""
+    rng = np.random.default_rng(seed)
+    at = np.arange(count)[:, None] / 100
+    swing = np.sin(2 * np.pi * rng.uniform(0.5, 4.0, 6) * at + rng.uniform(0, 6, 6)) * [2, 2, 2, 6, 6, 6]
+    return np.asarray(swing + rng.normal(size=(count, 6)) * [0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
+
+
+def given_on(values: F64) -> tuple[list[int], Sequencer]:
+    """The samples, by number, that a scan over all of them is given."""
+    sequencer = Sequencer(ImuParams())
+    for n, row in enumerate(values.tolist()):
+        sequencer.add_imu(n * 10 * MS, tuple(row[:3]), tuple(row[3:]))
+    sequencer.add_scan(scan(10, 10 * len(values) - 40))
+    (only,) = sequencer.ready()
+    assert isinstance(only, Measurement)
+    return (only.imu.stamps_ns // (10 * MS)).tolist(), sequencer
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_no_sample_of_a_vigorous_walk_is_refused(seed: int) -> None:
+    kept, sequencer = given_on(swaying(seed))
+    assert kept == list(range(198)) and sequencer.counts.imu_spikes == 0
+
+
+@given(
+    st.integers(0, 1000),
+    st.integers(0, 197),
+    st.integers(0, 5),
+    st.floats(25.0, 1e300) | st.sampled_from([float("nan"), float("inf")]),
+    st.sampled_from([-1, 1]),
+)
+@settings(max_examples=100, deadline=None)
+def test_one_bad_sample_is_left_out_wherever_it_is_and_no_other(
+    seed: int, place: int, axis: int, size: float, sign: int
+) -> None:
+    values = swaying(seed)
+    values[place, axis] = sign * size
+    kept, sequencer = given_on(values)
+    counts = sequencer.counts
+    assert counts.imu_invalid + counts.imu_out_of_range + counts.imu_spikes >= 1
+    assert set(range(198)) - set(kept) <= {place, 0}  # the first may go with its only neighbour
+    assert place not in kept
+
+
+def test_a_shock_that_lasts_is_no_spike() -> None:
+    values = swaying(1)
+    values[100:104, 3] += [20.0, 60.0, 60.0, 20.0]
+    assert given_on(values)[0] == list(range(198))
+
+
+def test_a_refused_sample_is_reported_with_the_measurement() -> None:
+    sequencer = Sequencer(ImuParams(max_acceleration=20.0))
+    for at in samples(0, 200):
+        sequencer.add_imu(at * MS, (0.0, 0.0, 0.0), (0.0, 0.0, 25.0 if at == 50 else 9.81))
+    sequencer.add_scan(scan(0))
+    (only,) = sequencer.ready()
+    assert isinstance(only, Measurement) and "beyond what an IMU can measure" in only.notices[0]
