@@ -98,11 +98,11 @@ def _sets_off_ns(imu: ImuSamples) -> int:
 
 
 def _samples(stamps: list[int], values: list[tuple[float, ...]]) -> ImuSamples:
-    """In order of time, each once, without those that are not numbers."""
+    """In order of time, each once, without those that no IMU measures."""
     rows = np.array(values, np.float64)
     times, first = np.unique(np.array(stamps, np.int64), return_index=True)
     rows = rows[first]
-    good = np.isfinite(rows).all(axis=1)
+    good = np.isfinite(rows).all(axis=1) & rows[:, 3:].any(axis=1)
     return ImuSamples(times[good], rows[good, :3], rows[good, 3:])
 
 

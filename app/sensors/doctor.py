@@ -175,15 +175,18 @@ def _imu_time(counts: Counts) -> Finding:
 
 def _imu_values(counts: Counts, samples: int, limits: ImuParams) -> Finding:
     bounds = f"{limits.max_acceleration:g} m/s² or {limits.max_rate:g} rad/s"
-    wrong = _listed((counts.imu_out_of_range, f"beyond {bounds}"), (counts.imu_spikes, "single spikes"))
+    left_out = counts.imu_out_of_range + counts.imu_spikes + counts.imu_weightless
+    wrong = _listed(
+        (counts.imu_out_of_range, f"beyond {bounds}"),
+        (counts.imu_spikes, "single spikes"),
+        (counts.imu_weightless, "without acceleration, not even gravity's"),
+    )
     if counts.imu_stuck:
         text = f"an axis reads the same number for {STUCK_SAMPLES} samples or more; check the IMU's driver"
         return Finding("IMU values", "needs you", text)
     if not wrong:
         return Finding("IMU values", "fine", f"none beyond {bounds}, no spikes")
-    verdict: FindingVerdict = (
-        "corrected" if counts.imu_out_of_range + counts.imu_spikes < 0.01 * samples else "needs you"
-    )
+    verdict: FindingVerdict = "corrected" if left_out < 0.01 * samples else "needs you"
     return Finding("IMU values", verdict, f"of {samples} samples {wrong}; those are left out")
 
 

@@ -15,7 +15,7 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.sections import RecordingParams
-from app.slam.types import F64, I64, Vector
+from app.slam.types import F64, I64, Mask, Vector
 
 STANDARD_GRAVITY = 9.80665
 ABSURD = 1e6
@@ -42,6 +42,14 @@ class ImuProbe:
     stamps_ns: I64
     gyro: F64
     accel: F64
+
+
+def measured(gyro: F64, accel: F64) -> Mask:
+    """(k,) which samples (k, 3), as recorded, an IMU can have measured. Without acceleration, if some have one, are
+    those of a driver that has lost its device."""
+    usual = (np.abs(accel) < ABSURD).all(axis=1) & (np.abs(gyro) < ABSURD).all(axis=1)
+    felt = usual & accel.any(axis=1)
+    return np.asarray(felt if felt.any() else usual)
 
 
 Axes = tuple[tuple[int, float], ...]

@@ -7,7 +7,7 @@ import numpy as np
 
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, Probe, stamped
 from app.sensors.findings import Finding
-from app.sensors.imu_units import ABSURD, ImuProbe
+from app.sensors.imu_units import ImuProbe, measured
 from app.sensors.ros import IMU, imu_values, stamp_ns
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
@@ -111,7 +111,7 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
             break
     has_stamps = len(set(stamps)) > 1
     rows = np.array(values, np.float64).reshape(-1, 6)
-    good = (np.abs(rows) < ABSURD).all(axis=1)
+    good = measured(rows[:, :3], rows[:, 3:])
     if not good.any():
         raise HemislamError(
             f"The first {len(rows)} IMU samples on {topic} in {source.path} are all NaN or absurd; "

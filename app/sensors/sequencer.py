@@ -45,6 +45,7 @@ class Counts:
     imu_duplicates: int = 0
     imu_back_steps: int = 0
     imu_invalid: int = 0
+    imu_weightless: int = 0
     imu_out_of_range: int = 0
     imu_spikes: int = 0
     imu_stuck: int = 0
@@ -109,6 +110,9 @@ class Sequencer:
         values = (*gyro, *accel)
         if not all(map(math.isfinite, values)):
             self._count("imu_invalid", "an IMU sample is NaN or infinite and was left out")
+            return
+        if not any(accel):
+            self._count("imu_weightless", "an IMU sample has no acceleration, not even gravity's, and was left out")
             return
         if max(map(abs, gyro)) > self.limits.max_rate or max(map(abs, accel)) > self.limits.max_acceleration:
             self._count("imu_out_of_range", "an IMU sample is beyond what an IMU can measure and was left out")

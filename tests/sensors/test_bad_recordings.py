@@ -210,6 +210,20 @@ def test_an_imu_of_nan_is_refused(tmp_path: Path) -> None:
     assert "are all NaN or absurd" in refusal(rig.write(tmp_path / "walk", entries))
 
 
+def test_an_imu_that_begins_with_zeros_is_read_by_what_follows(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log, accel=(0.0, 0.0, 0.0 if log < rig.START_NS + 10**9 else 1.0)))
+        if topic == "/imu"
+        else (topic, log, sent)
+        for topic, log, sent in rig.walk(turns=15, columns=4)
+    ]
+    with open_recording(rig.write(tmp_path / "walk", entries), Params()) as recording:
+        units = next(finding for finding in recording.findings if finding.subject == "IMU units")
+        read = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
+    assert "norm is 1 at the start" in units.text
+    assert read and all(measurement.imu.accel[:, 2].min() > 9.0 for measurement in read)
+
+
 def test_a_part_beyond_the_end_is_refused_with_the_length_of_the_recording(tmp_path: Path) -> None:
     path = rig.write(tmp_path / "walk", rig.walk(turns=4, columns=4))
     with (

@@ -57,6 +57,17 @@ def test_outages_steps_back_and_missing_scans_are_counted(tmp_path: Path) -> Non
     assert "2 missing" in found["scan time"].text and "0.300 s" in found["scan time"].text
 
 
+def test_zeros_in_place_of_imu_samples_are_named_and_are_a_gap(tmp_path: Path) -> None:
+    entries = [
+        (topic, log, rig.imu(log, accel=(0.0, 0.0, 0.0)) if topic == "/imu" and 5 < n / 20 < 10 else sent)
+        for n, (topic, log, sent) in enumerate(rig.walk(turns=20, columns=4))
+    ]
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert found["IMU values"].verdict == "needs you"
+    assert "without acceleration, not even gravity's" in found["IMU values"].text
+    assert found["IMU gaps"].verdict == "needs you" and found["pairing"].verdict == "fine"
+
+
 def test_an_imu_that_stops_for_good_is_a_gap_to_the_end(tmp_path: Path) -> None:
     found = by_subject(rig.write(tmp_path / "walk", rig.walk(turns=20, columns=4, imu_stop_ns=1_000_000_000)))
     assert found["IMU gaps"].verdict == "needs you" and "1 longer than 0.1 s" in found["IMU gaps"].text

@@ -72,3 +72,17 @@ def test_a_refused_sample_is_reported_with_the_measurement() -> None:
     sequencer.add_scan(scan(0))
     (only,) = sequencer.ready()
     assert isinstance(only, Measurement) and "beyond what an IMU can measure" in only.notices[0]
+
+
+def test_samples_without_gravity_are_left_out_and_leave_a_gap() -> None:
+    """A driver that has lost its device sends zeros; an IMU with a noisy axis that reads 0 once is none."""
+    sequencer = Sequencer(ImuParams())
+    for at in samples(0, 500):
+        lost = 210 <= at < 410
+        sequencer.add_imu(at * MS, (0.0 if lost else at / 1e6, 0.0, 0.0), (0.0, 0.0, 0.0 if lost else 9.81))
+    for n in range(4):
+        sequencer.add_scan(scan(100 * n, 100))
+    out = [entry for entry in sequencer.ready() if isinstance(entry, Measurement)]
+    assert [(entry.imu.stamps_ns // MS).tolist() for entry in out[2:]] == [[200, 410], [200, 410]]
+    assert sequencer.counts.imu_weightless == 20 and sequencer.counts.imu_gaps == 1
+    assert any("not even gravity's" in notice for notice in out[0].notices)

@@ -16,7 +16,7 @@ import numpy as np
 
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
-from app.sensors.imu_units import ABSURD, AS_RECORDED, ImuProbe, ImuUnits, settle_imu
+from app.sensors.imu_units import AS_RECORDED, ImuProbe, ImuUnits, measured, settle_imu
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Counters, Kind, LiveState, Status
@@ -193,10 +193,10 @@ class Intake:
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)
         gyro = np.array([sample.gyro for sample in samples], np.float64)
-        finite = (np.abs(accel) < ABSURD).all(axis=1) & (np.abs(gyro) < ABSURD).all(axis=1)
-        if not finite.any():
+        good = measured(gyro, accel)
+        if not good.any():
             return False
-        probe = ImuProbe(stamps[finite], stamps[finite], gyro[finite], accel[finite])
+        probe = ImuProbe(stamps[good], stamps[good], gyro[good], accel[good])
         try:
             self._units, findings = settle_imu(probe, self._params.recording)
         except HemislamError as error:

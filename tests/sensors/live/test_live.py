@@ -38,13 +38,14 @@ class Rig:
         self.turns = 0
         self.noise = np.random.default_rng(0)
 
-    def turn(self, *, lidar: bool = True, imu: bool = True) -> None:
+    def turn(self, *, lidar: bool = True, imu: bool = True, zeros: bool = False) -> None:
         """A tenth of a second, and the IMU sample after it: the last one is used when another follows."""
         for k in range(0 if self.turns == 0 else 2, 22):
             if imu:
                 (wx, wy, wz), (x, y, z) = self.noise.normal(size=(2, 3)) * 1e-3
                 accel = (self.accel[0] + x, self.accel[1] + y, self.accel[2] + z)
-                self.intake.put_imu(self.imu_ns + k * 5_000_000, (wx, wy, wz), accel, self.now + k * 5_000_000)
+                gyro, accel = ((0.0, 0.0, 0.0),) * 2 if zeros else ((wx, wy, wz), accel)
+                self.intake.put_imu(self.imu_ns + k * 5_000_000, gyro, accel, self.now + k * 5_000_000)
         if lidar:
             points = np.full((100, 3), 2.0 + self.turns, np.float32)
             offsets = np.linspace(0, 99_000_000, 100).astype(np.int32)
@@ -168,14 +169,17 @@ def test_acceleration_in_g_is_scaled_and_reported() -> None:
     assert ports.measurements(events)[0].imu.accel[0, 2] == pytest.approx(9.80665, abs=0.05)
 
 
-def test_scans_go_on_without_an_imu_that_dies_and_with_it_when_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("zeros", [False, True])
+def test_scans_go_on_without_an_imu_that_dies_and_with_it_when_it_is_back(
+    zeros: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("app.sensors.live.source.SILENCE_S", 0.05)
     rig = Rig()
     for _ in range(12):
         rig.turn()
     assert scans(rig.events()) == list(range(12))
     for _ in range(8):
-        rig.turn(imu=False)
+        rig.turn(imu=zeros, zeros=zeros)
     assert scans(rig.events()) == [], "it may only be late"
     time.sleep(0.1)
     alone = rig.events() + rig.events()
