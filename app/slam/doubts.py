@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from app.slam.imu import LONG_GAP
 from app.slam.run_log import RunLog
 from app.slam.types import F64, FrameStatus
 
@@ -22,7 +23,7 @@ TAKEN_BACK, NOISE = 0.07, 0.05
 to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a mounting off by 5 deg or a clock off by
 20 ms leave 0.07 to 0.4."""
 SURPRISING, OFTEN = 4.0, 3
-"""Surprise of a frame (`Registration`), and how many such frames it takes. Clean sensors stay below 0.3, imperfect
+"""Surprise of a frame (`Registration`), and how many doubtful frames it takes. Clean sensors stay below 0.3, imperfect
 ones below 3.5; where scans show little but people and false points, it reaches 5 to 89."""
 LATE_S = 0.01
 """How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
@@ -46,7 +47,19 @@ def doubts(log: RunLog) -> tuple[str, ...]:
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
     of_sensors = _of_imu(log) or _of_surprise(log, times)  # a wrong mounting surprises as well
-    return (*found, *_of_clock(log), *of_sensors)
+    return (*found, *_of_silence(log, times), *_of_clock(log), *of_sensors)
+
+
+def _of_silence(log: RunLog, times: F64) -> list[str]:
+    """Whether the scans leave the motion open while the IMU is silent."""
+    is_lost = np.array([frame.status is FrameStatus.LOST for frame in log.frames], dtype=bool)
+    blind = is_lost & (log.readout("imu_gap_s") > LONG_GAP)
+    if np.count_nonzero(blind) < OFTEN:
+        return []
+    return [
+        f"In {np.count_nonzero(blind)} frames the IMU is silent and the scans leave the motion open"
+        f"{_since(times, blind)}; the map may be metres off from then on."
+    ]
 
 
 def _of_clock(log: RunLog) -> list[str]:

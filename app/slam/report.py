@@ -43,6 +43,7 @@ def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo, sha256: str 
             "dropped": log.dropped.total(),
             "dropped_reasons": dict(log.dropped.most_common()),
         },
+        "imu_gaps_s": log.imu_gaps_s(info.params.imu.max_gap),
         "distance_m": trajectory.distance,
         "ground": {
             "share": log.ground_share,
@@ -112,6 +113,8 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
             ("loops", f"{loops['accepted']} accepted, {loops['candidate']} candidates, {loops['rejected']} rejected")
         )
     lines += [("dropped", f"{count} x {reason}") for reason, count in frames["dropped_reasons"].items()]
+    if gaps := report["imu_gaps_s"]:
+        lines.append(("IMU", f"missing for {sum(gaps):.1f} s, at most {max(gaps):.1f} s at a time"))
     if ground["f1"] is not None:
         scores = f"precision {ground['precision'] or 0:.3f}, recall {ground['recall'] or 0:.3f}, F1 {ground['f1']:.3f}"
         lines.append(("ground", f"{scores} against the recording's labels"))

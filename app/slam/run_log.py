@@ -74,6 +74,14 @@ class RunLog:
         """(n,) one of `READOUTS`; nan where there is none."""
         return np.asarray(self._table["readouts"][:, READOUTS.index(name)])
 
+    def imu_gaps_s(self, least_s: float) -> list[float]:
+        """s, how long each gap in the IMU lasted, of those longer than `least_s`; gaps in adjacent frames count as one,
+        as long as the longest."""
+        gaps = self.readout("imu_gap_s")
+        inside = gaps > least_s
+        begins = np.flatnonzero(inside & ~np.r_[False, inside[:-1]])
+        return np.maximum.reduceat(np.where(inside, gaps, 0.0), begins).tolist() if len(begins) else []
+
     @property
     def odometry(self) -> Trajectory:
         """T_odom_imu at every scan's end; the origin while the filter waits at rest to start."""

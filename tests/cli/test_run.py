@@ -153,14 +153,15 @@ def test_a_recording_whose_imu_is_silent_is_mapped_by_the_lidar_alone_and_says_s
     assert json.loads((tmp_path / "out" / "report.json").read_text())["frames"]["processed"] == 39
 
 
-def test_scans_after_the_last_imu_sample_are_mapped_by_the_lidar_alone(
+def test_scans_after_the_last_imu_sample_are_mapped_by_the_lidar_alone_and_the_time_is_given(
     hemislam: Call, walk_without: Callable[[float], Path], tmp_path: Path
 ) -> None:
     outcome = hemislam("run", walk_without(3.0), "--out", tmp_path / "out")
     assert outcome.code == 0, outcome.err
-    assert "the IMU has fallen silent" in outcome.out
+    assert "the IMU has fallen silent" in outcome.out and "IMU        missing for" in outcome.out
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert (report["frames"]["processed"], report["frames"]["dropped"]) == (39, 0)
+    assert report["imu_gaps_s"] == [pytest.approx(1.0, abs=0.1)]
     assert len((tmp_path / "out" / "timings.csv").read_text().splitlines()) == 40
 
 

@@ -6,6 +6,7 @@ Tests app/export/folder.py, app/export/map_file.py, app/export/points.py, app/sl
 import csv
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,15 @@ def test_degrees_that_positions_do_not_fix_are_withheld_with_the_reason(tmp_path
     assert withheld["accuracy"]["ate_m"]["rmse"] > 0.1
     assert "one straight line" in withheld["accuracy"]["ate_deg_withheld"]
     assert "no rotation error: The truth lies within" in summarise(withheld, tmp_path)
+
+
+def test_the_summary_says_for_how_long_the_imu_was_missing(tmp_path: Path, recording: Path) -> None:
+    gaps = [0.005, 0.3, 0.3, 0.005, 0.14, 0.24, 0.34, 0.44]  # the last one is still going on
+    frames = [Frame.of(replace(frame(k), imu_gap_s=gap)) for k, gap in enumerate(gaps)]
+    report = save_results(tmp_path / "out", Results(RunLog(frames), [], RunInfo(recording, Params())))
+    assert report["imu_gaps_s"] == [0.3, 0.44]
+    assert "missing for 0.7 s, at most 0.4 s at a time" in summarise(report, tmp_path)
+    assert "missing for" not in summarise(report | {"imu_gaps_s": []}, tmp_path)
 
 
 def test_a_truth_that_does_not_fit_is_reported_in_the_report(tmp_path: Path, recording: Path) -> None:

@@ -50,6 +50,13 @@ def test_a_walk_that_is_mostly_lost_is_reported(lost: int, told: bool) -> None:
     assert found == ((f"Tracking was lost in {lost} of 200 frames, first at 0.0 s.",) if told else ())
 
 
+@pytest.mark.parametrize(("gap_s", "told"), [(0.005, False), (12.0, True)])
+def test_a_few_frames_in_which_neither_sensor_shows_the_motion_are_reported(gap_s: float, told: bool) -> None:
+    found = doubts(log(WALK, [FrameStatus.TRACKING] * 20 + [FrameStatus.LOST] * 10, imu_gap_s=gap_s))
+    assert bool(found) is told and all("In 10 frames the IMU is silent" in doubt for doubt in found)
+    assert all("first at 2.0 s" in doubt for doubt in found)
+
+
 def test_a_walk_of_which_most_scans_were_dropped_is_reported() -> None:
     (doubt,) = doubts(log(WALK, dropped=300))
     assert doubt == "300 of 500 scans were dropped, mostly because it was dark."
