@@ -102,7 +102,7 @@ class Engine:
             notices.append("There is no IMU: motion is estimated from the LiDAR alone, less accurately.")
         elif belief is None:
             started = start.proceed(still, scan, samples, p)
-            belief, still, waiting = started.belief, started.still, started.waiting
+            belief, still, waiting = started.belief, started.still, started.waiting and gapless
             notices += [started.notice] if started.notice else []
         if len(samples):
             before_scan = belief if gapless else imu.before_gap(belief)
@@ -141,9 +141,10 @@ class Engine:
                 sampled = replace(sampled, points=points[source])
                 # the prediction was no measurement that the scan could contradict
                 registration = replace(registration, predicted_change=np.nan, correction=np.nan)
-                if not len(samples) and registration.degenerate and coast.is_adrift(posterior):
-                    adrift = True
-                    registration = replace(registration, reason=f"{registration.reason}, and there is no IMU")
+                blind = not len(samples) or not gapless
+                if blind and registration.degenerate and coast.is_adrift(posterior):
+                    adrift, why = True, "the IMU is silent" if len(samples) else "there is no IMU"
+                    registration = replace(registration, reason=f"{registration.reason}, and {why}")
         posterior = posterior if gapless else imu.after_gap(posterior, belief)
         status = FrameStatus.LOST if adrift else _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")

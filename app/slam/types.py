@@ -132,7 +132,7 @@ class NavState:
 
     Attributes:
         R_odom_imu: (3, 3). p_odom_imu: (3,) m. v_odom_imu: (3,) m/s.
-        b_gyro: (3,) rad/s and b_accel: (3,) m/s^2, IMU frame.
+        b_gyro: (3,) rad/s and b_accel: (3,) m/s^2, IMU frame. Without an IMU, b_gyro is minus the rate of turn.
         g_odom: (3,) m/s^2, gravity (pointing down, norm fixed).
         R_imu_lidar: (3, 3). p_imu_lidar: (3,) m.
     """
