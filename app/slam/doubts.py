@@ -13,7 +13,7 @@ FASTEST = 10.0
 HARDEST = 60.0
 """m/s^2 between three frames, lasting a tenth of a second: over 5 g, a fall onto the floor."""
 LEAP, LEAP_TIMES = 0.5, 4.0
-"""A leap is a step between two frames that is longer than this (m) and than this many times the usual step there."""
+"""A leap is a step between two frames that is longer than this (m) and this many times as fast as those beside it."""
 MOST_LOST, MOST_DROPPED = 0.1, 0.5
 """Shares of the frames that may be lost, and of the scans that may be dropped."""
 WALKING = 0.1
@@ -110,8 +110,8 @@ def _of_motion(positions: F64, times: F64) -> list[str]:
     velocities = steps / intervals[:, None]
     spans = np.maximum((intervals[1:] + intervals[:-1]) / 2, 0.1)
     hard = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / spans
-    before, after = np.r_[lengths[:1], lengths[:-1]], np.r_[lengths[1:], lengths[-1:]]
-    leaps = (lengths > LEAP) & (lengths > LEAP_TIMES * np.maximum(before, after)) & (intervals < 0.5)
+    before, after = np.r_[speeds[:1], speeds[:-1]], np.r_[speeds[1:], speeds[-1:]]
+    leaps = (lengths > LEAP) & (speeds > LEAP_TIMES * np.maximum(before, after))
     if leaps.any():
         found.append(f"It leaps by up to {lengths[leaps].max():.1f} m between two frames{_since(times[1:], leaps)}.")
     if not found and (too_hard := hard > HARDEST).any():

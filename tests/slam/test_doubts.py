@@ -34,6 +34,13 @@ def test_one_leap_is_reported_with_its_size_and_time() -> None:
     assert "leaps by up to 0.8 m" in doubt and "first at 12.0 s" in doubt
 
 
+def test_missing_scans_are_no_leaps() -> None:
+    kept = np.random.default_rng(0).random(len(WALK)) > 0.5
+    frames = [frame for frame, keep in zip(log(WALK).frames, kept, strict=True) if keep]
+    assert np.diff([frame.position[0] for frame in frames]).max() > 0.5
+    assert doubts(RunLog(frames)) == ()
+
+
 def test_no_person_moves_at_a_hundred_metres_a_second() -> None:
     (doubt,) = doubts(log(WALK * [100, 1, 1]))
     assert "120 m/s, first at 0.1 s" in doubt
