@@ -24,6 +24,9 @@ OUTAGE_NS = 1_000_000_000
 MAX_WAITING = 64
 """Scans that wait for IMU samples at most; bounds the memory when the IMU falls silent."""
 
+BLIND_NS = 10_000_000_000
+"""A scan that comes more than this after the one before, beyond the IMU's samples, has a wrong clock."""
+
 MAX_SAMPLES = 100_000
 """IMU samples that may wait for a scan, eight minutes at 200 Hz: nobody dead-reckons longer than that."""
 
@@ -283,8 +286,11 @@ class Sequencer:
             return "there is no IMU sample"
         if begin_ns < self._stamps[0]:
             return "the IMU starts after it"
-        if end_ns > self._stamps[-1] and self._last_end_ns is None:
-            return "the IMU stops before its end"
+        if end_ns > self._stamps[-1]:
+            if self._last_end_ns is None:
+                return "the IMU stops before its end"
+            if begin_ns > self._last_end_ns + BLIND_NS:
+                return "its time is far ahead of the scan before it and of the IMU"
         return ""
 
     def _tell_gaps(self, stamps_ns: I64, end_ns: int) -> None:

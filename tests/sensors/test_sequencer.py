@@ -56,6 +56,14 @@ def dropped(entries: Sequence[Measurement | DroppedScan]) -> list[tuple[int, str
     return [(entry.stamp_ns // MS, entry.reason) for entry in entries if isinstance(entry, DroppedScan)]
 
 
+def test_scans_whose_clock_leaps_ahead_of_an_imu_are_no_walk_by_the_lidar_alone() -> None:
+    """An hour ahead from the fourth scan on; those are dropped, and a walk of an hour is not made up."""
+    leapt = [scan(3_600_000 + at) for at in range(300, 800, 100)]
+    out, _ = feed(samples(-35, 900), [scan(0), scan(100), scan(200), *leapt])
+    assert sum(isinstance(entry, Measurement) for entry in out) == 3
+    assert {reason for _, reason in dropped(out)} == {"its time is far ahead of the scan before it and of the IMU"}
+
+
 def test_samples_run_from_the_previous_scans_end_to_this_scans_end() -> None:
     out, _ = feed(samples(-35, 335), [scan(0), scan(100), scan(200)])
     assert stamps(out[0]) == samples(-35, 105)  # the first: all there are, and one at or past the end

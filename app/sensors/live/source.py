@@ -106,8 +106,12 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         self.close()
 
     def _gather(self, timeout_s: float) -> None:
-        """Pass scans to the sequencer one at a time, so that later ones can still be dropped."""
-        rest, scan = self._intake.take(timeout_s, scan=self._sequencer.waiting <= self._imu_is_silent())
+        """Pass scans to the sequencer one at a time, so that later ones can still be dropped.
+
+        While the IMU is silent, the next scan sends the waiting one on its way.
+        """
+        silent = self._imu_is_silent()
+        rest, scan = self._intake.take(timeout_s, scan=silent or not self._sequencer.waiting)
         for entry in rest:
             if isinstance(entry, ImuEntry):
                 self._sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
@@ -115,7 +119,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
                 self._events.append(entry)
         if scan is not None:
             self._sequencer.add_scan(scan)
-        self._events.extend(self._sequencer.ready(1 if self._imu_is_silent() else MAX_WAITING))
+        self._events.extend(self._sequencer.ready(1 if silent else MAX_WAITING))
 
     def _imu_is_silent(self) -> bool:
         """Whether no sample that the sequencer accepts has come for a while."""
