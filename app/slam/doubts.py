@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from app.slam import iekf
 from app.slam.imu import LONG_GAP
 from app.slam.run_log import RunLog
 from app.slam.types import F64, FrameStatus
@@ -22,9 +23,8 @@ TAKEN_BACK, NOISE = 0.07, 0.05
 """Share of the velocity's change by the IMU that the scans may take back, beside NOISE m/s. A clean sensor leaves 0.01
 to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a mounting off by 5 deg or a clock off by
 20 ms leave 0.07 to 0.4."""
-SURPRISING, OFTEN = 4.0, 3
-"""Surprise of a frame (`Registration`), and how many doubtful frames it takes. Clean sensors stay below 0.3, imperfect
-ones below 3.5; where scans show little but people and false points, it reaches 5 to 89."""
+OFTEN = 3
+"""Of frames in which the sensors contradict each other, or in which none shows the motion, so many are doubtful."""
 LATE_S = 0.01
 """How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
 
@@ -90,13 +90,13 @@ def _of_imu(log: RunLog) -> list[str]:
 
 def _of_surprise(log: RunLog, times: F64) -> list[str]:
     """Whether scans put the scanner elsewhere than the IMU, by more than the uncertainty of both."""
-    surprising = log.readout("surprise") > SURPRISING
+    surprising = log.readout("surprise") > iekf.SURPRISING
     if np.count_nonzero(surprising) < OFTEN:
         return []
     return [
         f"In {np.count_nonzero(surprising)} frames the scan and the IMU contradict each other about the motion"
-        f"{_since(times, surprising)}. The scans may show little but people or false points there, and the map may be "
-        "metres off from then on. If it is, add a loop by hand."
+        f"{_since(times, surprising)}. The scans may show little but people or false points there, or the IMU was "
+        "knocked. The map may be metres off from then on; if it is, add a loop by hand."
     ]
 
 

@@ -29,6 +29,9 @@ ENOUGH_PLANES, ENOUGH_SHARE, WALKING = 50, 0.45, 0.3
 planes are used too, weighted by their certainty: where the map is noisy or cluttered, they are better than none.
 Before the first step the map was seen from one place only, and poor planes along its scan lines would hold the scanner
 there."""
+SURPRISING = 4.0
+"""Surprise of a frame (`Registration`) above which the scan and the IMU contradict each other. Clean sensors stay below
+0.3, imperfect ones below 3.5; where scans show little but people and false points, it reaches 5 to 89."""
 DEGENERATE_SIGMA = 0.1
 """m (rotation: rad times the RMS range of the points): a direction that one scan alone leaves more
 uncertain than this is degenerate."""

@@ -28,6 +28,9 @@ GAP_RATE, GAP_NOISE = 1.0, 1.0
 """rad/s, m/s²/√Hz: in a gap, standard deviation of the rate of turn and noise density of the acceleration; those of a
 walking person's hand."""
 
+BIAS_LEAPS = 0.005, 0.05
+"""rad/s, m/s²: how far the biases of a consumer IMU may leap by a knock or a restart. Larger leaps take more frames."""
+
 
 @dataclass(frozen=True, slots=True)
 class Belief:
@@ -136,6 +139,14 @@ def after_gap(belief: Belief, before: Belief) -> Belief:
     covariance[BG] = covariance[:, BG] = 0.0
     covariance[BG, BG] = before.covariance[BG, BG]
     return Belief(replace(belief.state, b_gyro=before.state.b_gyro), covariance)
+
+
+def with_open_biases(belief: Belief) -> Belief:
+    """The belief after a scan has contradicted the IMU, whose biases may have leapt."""
+    covariance = belief.covariance.copy()
+    for bias, leap in zip((BG, BA), BIAS_LEAPS, strict=True):
+        covariance[bias, bias] += leap**2 * np.eye(3)
+    return replace(belief, covariance=covariance)
 
 
 def deskew(scan: Scan, path: Path, state: NavState) -> F32:
