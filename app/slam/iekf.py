@@ -139,6 +139,12 @@ def schmidt(prior: F64, information: F64, covariance: F64) -> F64:
     return posterior
 
 
+def is_imu_to_blame(registration: Registration) -> bool:
+    """Whether a scan contradicts the IMU, and shows enough planes not to be to blame itself."""
+    enough = registration.inliers >= ENOUGH_SHARE * registration.used
+    return registration.surprise > SURPRISING and enough
+
+
 def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
     """Normal equations without the directions in which normals' errors explain more than all that the points tell."""
     eigenvalues, axes = np.linalg.eigh(H)

@@ -168,6 +168,16 @@ def test_eigenvalues_ascend_and_are_of_the_information(room: LocalMap) -> None:
     np.testing.assert_allclose(many / few, 3, rtol=0.5)
 
 
+@pytest.mark.parametrize(
+    ("surprise", "inliers", "blamed"), [(3.5, 900, False), (9.0, 900, True), (9.0, 300, False), (np.nan, 900, False)]
+)
+def test_the_imu_is_to_blame_for_a_contradiction_if_the_scan_shows_enough(
+    room: LocalMap, surprise: float, inliers: int, blamed: bool
+) -> None:
+    _, found = iekf.update(correlated_prior(5e-3), points_of(furnished_room()), room, FilterParams())
+    assert iekf.is_imu_to_blame(replace(found, used=1000, inliers=inliers, surprise=surprise)) is blamed
+
+
 # --- what is estimated, and from which points
 def test_extrinsics_stay_unless_they_are_estimated(room: LocalMap) -> None:
     prior, points = correlated_prior(5e-3), points_of(furnished_room())
