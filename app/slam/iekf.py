@@ -140,7 +140,7 @@ def schmidt(prior: F64, information: F64, covariance: F64) -> F64:
 
 
 def is_imu_to_blame(registration: Registration) -> bool:
-    """Whether a scan contradicts the IMU, and shows enough planes not to be to blame itself."""
+    """Whether a scan contradicts the IMU and shows so many planes that the IMU is the likelier culprit."""
     enough = registration.inliers >= ENOUGH_SHARE * registration.used
     return registration.surprise > SURPRISING and enough
 

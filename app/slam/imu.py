@@ -127,14 +127,14 @@ def longest_gap(imu: ImuSamples, end_ns: int) -> float:
 
 
 def before_gap(belief: Belief) -> Belief:
-    """The belief at the begin of a scan with a gap: what the gyroscope would have read is open, as if its bias were."""
+    """The belief before a scan with a gap: its gyroscope bias is wide open and stands for the unknown rate of turn."""
     covariance = belief.covariance.copy()
     covariance[BG, BG] += GAP_RATE**2 * np.eye(3)
     return replace(belief, covariance=covariance)
 
 
 def after_gap(belief: Belief, before: Belief) -> Belief:
-    """The belief at the end of such a scan, with the gyroscope's bias as it was known `before`."""
+    """The belief after such a scan, with the gyroscope bias that was known `before`."""
     covariance = belief.covariance.copy()
     covariance[BG] = covariance[:, BG] = 0.0
     covariance[BG, BG] = before.covariance[BG, BG]

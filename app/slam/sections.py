@@ -173,7 +173,7 @@ class ImuParams(Section):
     )
     learn_clock: bool = _next_frame(True, "Learn the offset of the IMU's clock and correct its stamps.")
     max_gap: float = _next_frame(
-        0.1, "A longer gap between IMU samples is reported and bridged with a wide covariance.", (0.005, 5, 0.005), "s"
+        0.1, "A longer gap between IMU samples is reported, and bridged by the LiDAR.", (0.005, 5, 0.005), "s"
     )
 
 
