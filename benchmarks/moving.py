@@ -69,7 +69,7 @@ class _Walk:
     def __init__(self, scene: str, sizes: Imperfections, seed: int, *, people: bool) -> None:
         place, walker = build_scene(scene, seed), livelier(Walker(), sizes.hand)
         self._trajectory = trajectory_through(place, DURATION_S, seed, walker, DEVICE.R_body_imu)
-        beside = companions(sizes.companions, self._trajectory, place.height, _random(seed, 5))
+        beside = companions(sizes.companions, self._trajectory, place, _random(seed, 5))
         self._people = [_Body(mover) for mover in (*place.movers, *beside)] if people else []
         caster = Raycaster(place.mesh, tuple(body.mover for body in self._people))
         turns = DEVICE.patterns(RATE_HZ, EVERY_BLOCK, None)

@@ -277,6 +277,12 @@ class LoopsParams(Section):
     drift_translation: float = _next_frame(
         1.0, "Standard deviation of the drift in position, per distance moved.", (0.01, 20, 0.1), "%"
     )
+    drift_height: float = _next_frame(
+        0.2,
+        "Standard deviation of the drift in height, per distance moved; gravity keeps it small.",
+        (0.01, 20, 0.1),
+        "%",
+    )
     drift_rotation: float = _next_frame(
         0.02, "Standard deviation of the drift in heading, per distance moved.", (0.001, 2, 0.005), "deg/m"
     )

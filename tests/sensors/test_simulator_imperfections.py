@@ -14,6 +14,7 @@ from app.sensors.simulator.imperfections import IMPERFECT, NONE, Imperfections, 
 from app.sensors.simulator.lidar import Lidar, firing_pattern
 from app.sensors.simulator.mesh import MeshBuilder
 from app.sensors.simulator.raycast import Raycaster
+from app.sensors.simulator.scenes import build_scene
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker
 from app.slam.errors import HemislamError
 from app.slam.types import F64, ImuSamples, Scan
@@ -145,7 +146,8 @@ def test_samples_are_lost_and_stamps_are_late_and_shaky() -> None:
 
 def test_companions_stay_one_to_three_metres_away_and_stand_on_the_ground() -> None:
     trajectory = walking()
-    people = companions(3, trajectory, lambda xy: 0.1 * xy[:, 0], np.random.default_rng(0))
+    slope = replace(build_scene("room", 0), height=lambda xy: 0.1 * xy[:, 0])
+    people = companions(3, trajectory, slope, np.random.default_rng(0))
     t = np.arange(0.0, 4.0, 0.05)
     where = np.array([person.pose(t)[0] for person in people])
     apart = where[:, :, :2] - trajectory.poses(t)[0][:, :2]
@@ -153,7 +155,9 @@ def test_companions_stay_one_to_three_metres_away_and_stand_on_the_ground() -> N
     assert len(people) == 3 and distance.min() > 1.0 and distance.max() < 3.2
     np.testing.assert_allclose(where[:, :, 2], 0.1 * where[:, :, 0])
     assert (apart[0, :, 0] > 0).all() and (apart[1, :, 0] < 0).all()
-    crossing = np.concatenate([companions(3, trajectory, None, np.random.default_rng(k))[2].pose(t)[0] for k in (1, 2)])
+    crossing = np.concatenate(
+        [companions(3, trajectory, slope, np.random.default_rng(k))[2].pose(t)[0] for k in (1, 2)]
+    )
     assert crossing[:, 1].min() < 0 < crossing[:, 1].max()
 
 

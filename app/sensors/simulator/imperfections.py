@@ -3,13 +3,13 @@
 Each term is one field of `Imperfections`: its size, 0 where it is off. `IMPERFECT` has the sizes of real devices.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.sensors.robosense import CHANNELS
-from app.sensors.simulator.raycast import Hits, Mover, Raycaster
+from app.sensors.simulator.raycast import Hits, Mover, Raycaster, SimulatedScene
 from app.sensors.simulator.scenes.props import person_mesh
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds
 from app.slam.lie import exp, transform
@@ -167,9 +167,10 @@ def livelier(walker: Walker, times: float) -> Walker:
 
 
 def companions(
-    number: float, trajectory: SmoothTrajectory, height: Callable[[F64], F64] | None, rng: np.random.Generator
+    number: float, trajectory: SmoothTrajectory, place: SimulatedScene, rng: np.random.Generator
 ) -> tuple[Mover, ...]:
     """People who go with the operator: one ahead, one behind, one who crosses in front, 1-3 m away."""
+    climbs = place.path.shape[1] == 3
     swing, phase = rng.uniform(0.3, 0.7, (3, 2)), rng.uniform(0, 2 * np.pi, (3, 2))
 
     def company(who: int) -> Mover:
@@ -181,7 +182,8 @@ def companions(
             along, left = ((1.9 + 0.6 * u, 0.5 * v), (-1.7 + 0.5 * u, 0.6 * v), (1.8 + 0.4 * u, 2.2 * v))[who]
             c, s = np.cos(heading), np.sin(heading)
             xy = places[:, :2] + np.column_stack([c * along - s * left, s * along + c * left])
-            z = np.zeros(len(t)) if height is None else height(xy)
+            level = places[:, 2] - Walker().height if climbs else np.zeros(len(t))
+            z = level if place.height is None else place.height(xy)
             return np.column_stack([xy, z]), heading + (np.pi / 2 if who == 2 else 0.0)
 
         return Mover(person_mesh(1.65 + 0.1 * who), pose)

@@ -66,6 +66,12 @@ class MeshBuilder:
             np.concatenate(self._ground),
         )
 
+    def place(self, mesh: Mesh, at: Triple) -> None:
+        """A finished mesh, moved but not turned."""
+        for ground in (0, 1):
+            which = mesh.ground == ground
+            self.add(mesh.vertices + np.asarray(at), mesh.faces[which], mesh.reflectivity[which], bool(ground))
+
     def quad(self, corners: Sequence[Sequence[float]], reflectivity: float, ground: bool = False) -> None:
         """Four corners in order around."""
         self.add(np.array(corners, np.float64), np.array([[0, 1, 2], [0, 2, 3]]), reflectivity, ground)

@@ -29,8 +29,8 @@ class Mover:
 class SimulatedScene:
     """Attributes:
     mesh: everything static, world frame. movers: bodies that move.
-    path: (n, 2) waypoints of the trajectory in plan, m. closed: whether it is repeated lap by lap.
-    height: the ground's z at (n, 2) points; None is z = 0.
+    path: (n, 2) waypoints of the trajectory in plan, m, or (n, 3) with the floor's z there.
+    closed: whether it is repeated lap by lap. height: the ground's z at (n, 2) points; None is z = 0, or the path's.
     """
 
     mesh: Mesh

@@ -118,7 +118,7 @@ def simulate(
     place = build_scene(scene, seed)
     walker = livelier(walker or Walker(), imperfections.hand)
     trajectory = trajectory_through(place, duration_s, seed, walker, device.R_body_imu)
-    company = companions(imperfections.companions, trajectory, place.height, _random(seed, _PEOPLE))
+    company = companions(imperfections.companions, trajectory, place, _random(seed, _PEOPLE))
     caster = Raycaster(place.mesh, (*place.movers, *company))
     turns = device.patterns(rate_hz, every_block, tables)
     unit = None if imperfections == NONE else unit_of(imperfections, seed, turns(0).channels)

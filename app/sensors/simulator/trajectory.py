@@ -126,7 +126,8 @@ def walk(
     """A person walks along waypoints, round a closed path for all of the time, or to the end of an open one.
 
     Args:
-        path: (n, 2) waypoints in plan, m. height: the ground's z at (n, 2) points; None is z = 0.
+        path: (n, 2) waypoints in plan, m, or (n, 3) with the floor's z there. height: the ground's z at (n, 2) points;
+            None is z = 0, or the path's.
         R_body_imu: how the IMU is mounted.
     """
     t = np.arange(-1.0, duration_s + 1.0, 1.0 / _SAMPLE_HZ)
@@ -141,18 +142,18 @@ def walk(
     line, arc = _unrolled(path, closed, travelled[-1] + 5.0)
     if not closed:
         travelled = _brake(travelled, arc[-1])
-    xy = places_at(travelled, arc, line)
-    xy = np.column_stack([_smoothed(xy[:, k], 0.4 * _SAMPLE_HZ) for k in (0, 1)])
+    places = places_at(travelled, arc, line)
+    xy = np.column_stack([_smoothed(places[:, k], 0.4 * _SAMPLE_HZ) for k in (0, 1)])
 
     # The walker looks half a metre ahead, and turns over about as much.
     step = 0.05
     s = np.arange(0.0, arc[-1], step)
-    directions = np.unwrap(np.arctan2(*np.gradient(places_at(s, arc, line), axis=0).T[::-1]))
+    directions = np.unwrap(np.arctan2(*np.gradient(places_at(s, arc, line)[:, :2], axis=0).T[::-1]))
     directions = _smoothed(directions, 0.6 / step)
     heading = np.interp(travelled + 0.5, s, directions)
     heading = _smoothed(heading, 0.2 * _SAMPLE_HZ)
 
-    floor = np.zeros(len(t)) if height is None else height(xy)
+    floor = height(xy) if height is not None else places[:, 2] if places.shape[1] == 3 else np.zeros(len(t))
     floor = _smoothed(floor, 0.3 * _SAMPLE_HZ)
 
     steps = 2 * np.pi * _STEP_HZ * (t + 0.3 * _wander(t, rng, (0.05, 0.1)) / _STEP_HZ)
@@ -214,8 +215,8 @@ def _unrolled(path: F64, closed: bool, length: float) -> tuple[F64, F64]:
 
 
 def places_at(lengths: F64, arc: F64, line: F64) -> F64:
-    """(k, 2) places on a polyline at these arc lengths; `arc` is `walked_m(line)`."""
-    return np.column_stack([np.interp(lengths, arc, line[:, axis]) for axis in (0, 1)])
+    """(k, 2 or 3) places on a polyline of such points at these arc lengths; `arc` is `walked_m(line)`."""
+    return np.column_stack([np.interp(lengths, arc, along) for along in line.T])
 
 
 def _brake(travelled: F64, end: float) -> F64:

@@ -1,13 +1,15 @@
 """How far odometry may have drifted between two keyframes, and whether measured loops agree with it.
 
 The filter's covariance does not show this: it takes the map as exact, so it stays at millimetres however long the
-trajectory. Drift grows with the distance. Model: position drifts by a share of the distance, heading by an angle per
-metre, both constant (the worst case, as nothing averages out) and independent. Gravity fixes roll and pitch. The
-distance between two keyframes is the shortest one through the graph: accepted loops are short cuts.
+trajectory. Drift grows with the distance. Model: position drifts by a share of the distance, height by a smaller one,
+heading by an angle per metre, all constant (the worst case, as nothing averages out) and independent. Gravity fixes
+roll and pitch, and thereby the height. The distance between two keyframes is the shortest one through the graph:
+accepted loops are short cuts.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -25,15 +27,29 @@ POSITION_M, ROTATION = 0.05, np.radians(0.5)
 @dataclass(frozen=True, slots=True)
 class Drift:
     """Attributes:
-    translation: per distance. rotation: rad/m, of the heading. Standard deviations.
+    translation, height: per distance. rotation: rad/m, of the heading. Standard deviations.
     """
 
     translation: float
+    height: float
     rotation: float
 
     @classmethod
     def of(cls, params: LoopsParams) -> "Drift":
-        return cls(params.drift_translation / 100, np.radians(params.drift_rotation))
+        return cls(params.drift_translation / 100, params.drift_height / 100, np.radians(params.drift_rotation))
+
+
+class Deviation(NamedTuple):
+    """Of a measured pose from what the graph expects.
+
+    Attributes:
+        sigmas: of the whole pose, height_sigmas: of the height alone, in standard deviations. height: m, too high if
+            positive.
+    """
+
+    sigmas: float
+    height_sigmas: float
+    height: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +75,8 @@ class Expectation:
         sideways = self.drift.rotation * np.array([-self.lever[other, 1], self.lever[other, 0], 0.0])
         out = np.zeros((6, 6))
         out[:3, :3] = np.diag([0.0, 0.0, heading**2]) + ROTATION**2 * np.eye(3)
-        out[3:, 3:] = ((self.drift.translation * way) ** 2 + POSITION_M**2) * np.eye(3) + np.outer(sideways, sideways)
+        along = np.array([self.drift.translation, self.drift.translation, self.drift.height]) * way
+        out[3:, 3:] = np.diag(along**2) + POSITION_M**2 * np.eye(3) + np.outer(sideways, sideways)
         return out
 
     def position_sigmas(self) -> F64:
@@ -67,14 +84,16 @@ class Expectation:
         sideways = self.drift.rotation * np.hypot(self.lever[:, 0], self.lever[:, 1])
         return np.asarray(np.sqrt((self.drift.translation * self.way) ** 2 + sideways**2 + POSITION_M**2))
 
-    def mahalanobis(self, other: int, T_other_root: F64) -> float:
-        """Standard deviations between a measured (4, 4) pose of the root, seen from `other`, and the expected one."""
+    def deviation(self, other: int, T_other_root: F64) -> Deviation:
+        """Of a measured (4, 4) pose of the root, seen from `other`."""
         R = self.poses[other, :3, :3]
         expected = lie.inverse(self.poses[other]) @ self.poses[self.root]
         turned = R @ lie.log(T_other_root[:3, :3] @ expected[:3, :3].T)
         moved = R @ (T_other_root[:3, 3] - expected[:3, 3])
         error = np.concatenate([turned, moved])
-        return float(np.sqrt(error @ np.linalg.solve(self.covariance(other), error)))
+        covariance = self.covariance(other)
+        sigmas = float(np.sqrt(error @ np.linalg.solve(covariance, error)))
+        return Deviation(sigmas, abs(float(error[5])) / float(np.sqrt(covariance[5, 5])), float(error[5]))
 
 
 def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Expectation:

@@ -86,6 +86,7 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
     up = after.T_odom_imu[2, :3]  # gravity fixes the others
     covariance[:3, :3] += STILL_RAD**2 * np.eye(3) + drift.rotation**2 * even * np.outer(up, up)
     covariance[3:, 3:] += (STILL_M**2 + drift.translation**2 * even) * np.eye(3)
+    covariance[3:, 3:] += (drift.height**2 - drift.translation**2) * even * np.outer(up, up)
     return Factor(KeyframeId(0, second - 1), KeyframeId(0, second), T, (covariance + covariance.T) / 2)
 
 

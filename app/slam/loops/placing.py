@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.slam import lie
+from app.slam.loops.drift import Deviation
 from app.slam.loops.plan import EVERYWHERE, Window, placements
 from app.slam.loops.verification import Fit, Prepared, assess, refine, register, rough, slide
 from app.slam.types import F64
@@ -28,14 +29,14 @@ ALONG = 0.9
 @dataclass(frozen=True, slots=True)
 class Placement:
     """Attributes:
-    fit: the best alignment. deviation: of it from odometry, in standard deviations.
+    fit: the best alignment. deviation: of it from odometry.
     slides: m, by which it slid along the direction that holds least. open: that direction, (3,) unit in the target's
         axes, if nothing holds it there. loose: whether the next direction slides too.
     alternative_m: m to the nearest other alignment that fits as well and that odometry allows no less; inf if none.
     """
 
     fit: Fit
-    deviation: float
+    deviation: Deviation
     slides: float
     open: F64 | None
     loose: bool
@@ -47,17 +48,18 @@ def place(
     source: Prepared,
     T_guess: F64,
     window: Window,
-    deviation: Callable[[F64], float],
+    deviation: Callable[[F64], Deviation],
     most_sigmas: float,
     most_slide: float,
 ) -> Placement:
     """Align a submap with another.
 
-    If the best alignment contradicts odometry, odometry cannot rule out others either: they are looked for everywhere.
+    If the best alignment contradicts odometry, odometry cannot rule out others either: they are looked for everywhere,
+    but not if its height does, since that follows from the ground and would be the same elsewhere.
 
     Args:
         T_guess: (4, 4) of the level frames, by odometry; along a direction that is open, the result stays there.
-        deviation: of such a transform from odometry, in standard deviations. most_sigmas: up to which it is allowed.
+        deviation: of such a transform from odometry. most_sigmas: standard deviations up to which it is allowed.
         most_slide: m, up to which a direction holds.
     """
     starts = [T_guess, *(placements(target, source, T_guess, window) if window.reach_m >= APART_M else ())]
@@ -70,13 +72,14 @@ def place(
         fits = [assess(target, source, T) for T in found]
         best = max(fits, key=lambda fit: fit.overlap)
         good = [fit for fit in fits if fit is best or _as_good(fit, best)]  # without overlap it is not even itself
-        allowed = [fit for fit in good if deviation(fit.T_target_source) <= most_sigmas] or good
+        allowed = [fit for fit in good if deviation(fit.T_target_source).sigmas <= most_sigmas] or good
         chosen = max(allowed, key=lambda fit: fit.overlap).T_target_source
         others = [fit.T_target_source for fit in allowed if fit.T_target_source is not chosen]
     else:
         chosen, others = found[0], []
     fit = assess(target, source, refine(target, source, chosen))
-    if window is not EVERYWHERE and deviation(fit.T_target_source) > most_sigmas:
+    off = deviation(fit.T_target_source)
+    if window is not EVERYWHERE and off.sigmas > most_sigmas >= off.height_sigmas:
         return place(target, source, T_guess, EVERYWHERE, deviation, most_sigmas, most_slide)
 
     weakest, second, _ = fit.directions

@@ -8,6 +8,7 @@ from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import placing, scan_context, verification
 from app.slam.loops.backend import LoopBackend
+from app.slam.loops.drift import Deviation
 from app.slam.loops.factors import Factor
 from app.slam.loops.keyframe_log import Follower, KeyframeLog
 from app.slam.loops.messages import (
@@ -119,7 +120,8 @@ def warm_up() -> None:
     points[np.arange(len(sides)), sides] = 0.0  # a corner of three walls
     thin = VoxelGrid().downsample(points, 0.1).points
     place = verification.prepare(Submap(0, thin, np.full_like(thin, 2.0)))
-    found = placing.place(place, place, np.eye(4), Window(1.0, 0.1), lambda T: 0.0, most_sigmas=1.0, most_slide=0.1)
+    none = Deviation(0.0, 0.0, 0.0)
+    found = placing.place(place, place, np.eye(4), Window(1.0, 0.1), lambda T: none, most_sigmas=1.0, most_slide=0.1)
     verification.refine(place, place, found.fit.T_target_source)
     context = scan_context.describe(thin)
     scan_context.shift_distances(context, context)

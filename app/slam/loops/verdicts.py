@@ -7,7 +7,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.detection import WIDER, Detector, Sighting
-from app.slam.loops.drift import Drift, Expectation, expect
+from app.slam.loops.drift import Deviation, Drift, Expectation, expect
 from app.slam.loops.edits import Add
 from app.slam.loops.placing import Placement, place
 from app.slam.loops.plan import Window
@@ -57,7 +57,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
         condition=fit.condition,
         slide=found.slides,
         alternative_m=found.alternative_m,
-        mahalanobis=found.deviation,
+        mahalanobis=found.deviation.sigmas,
     )
     T = _imu(detector, older, newer, fit.T_target_source)
     return edge(T, covariance(detector, newer, fit, found.open), evidence, _objection(found, evidence, params))
@@ -68,8 +68,8 @@ def _place(
 ) -> Placement:
     """The alignment of the newer place with the older one, searched as far as odometry may be off."""
 
-    def deviation(T_level: F64) -> float:
-        return expectation.mahalanobis(older, _imu(detector, older, newer, T_level))
+    def deviation(T_level: F64) -> Deviation:
+        return expectation.deviation(older, _imu(detector, older, newer, T_level))
 
     sigma = float(expectation.position_sigmas()[older])
     reach = WIDER * params.max_mahalanobis
@@ -126,6 +126,11 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
         return f"the submaps overlap by {100 * e.overlap:.0f} % (least {100 * p.min_overlap:.0f} %)"
     if e.residual_rms > p.max_residual:
         return f"the residual is {1000 * e.residual_rms:.0f} mm (most {1000 * p.max_residual:.0f} mm)"
+    if place.deviation.height_sigmas > p.max_mahalanobis:
+        height = place.deviation.height
+        where = f"{abs(height):.1f} m {'above' if height > 0 else 'below'} where odometry expects it"
+        off = f"{place.deviation.height_sigmas:.1f} σ, most {p.max_mahalanobis:g} σ"
+        return f"it lies {where} ({off}), and storeys of a building look alike"
     if place.loose:
         most = f"most {1000 * p.max_slide:.0f} mm"
         return f"it slides in all directions: pushed, it ends {1000 * e.slide:.0f} mm off ({most})"

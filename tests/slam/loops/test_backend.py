@@ -78,6 +78,19 @@ def test_corridors_and_rooms_that_repeat_make_no_false_loop() -> None:
     assert errors[:, 1].max() < 2.0
 
 
+def test_storeys_that_look_alike_stay_above_one_another() -> None:
+    walk = take("storeys", 155.0)
+    backend = drive(walk.drifted(0.01, 0.02), PARAMS)
+    loops = accepted(backend)
+    errors = np.array([error(edge, walk.truth) for edge in loops])
+    height = walk.truth[:, 2, 3]
+    assert np.ptp(height) > 3.0
+    assert errors[:, 0].max() < 0.5, "the other storey is 3.3 m away"
+    found = {edge.newer for edge in loops}
+    assert np.mean([index in found for index in revisits(walk)]) > 0.6
+    assert any("storeys of a building look alike" in edge.reason for edge in backend.edges)
+
+
 # --- history -------------------------------------------------------------------------------------
 def test_the_same_walk_gives_the_same_loops_and_poses_to_the_last_bit(walked: Walked) -> None:
     again = drive(walked.keyframes, PARAMS)

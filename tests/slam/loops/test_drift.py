@@ -8,7 +8,7 @@ from app.slam.loops.drift import POSITION_M, ROTATION, Drift, expect
 from app.slam.loops.types import Evidence, LoopEdge, Verdict
 from app.slam.types import F64
 
-DRIFT = Drift(0.01, np.radians(0.02))
+DRIFT = Drift(0.01, 0.002, np.radians(0.02))
 
 
 def path(points: F64) -> F64:
@@ -37,7 +37,7 @@ def test_doubt_grows_with_the_way_not_with_the_distance() -> None:
 def test_the_lever_arm_is_what_a_steady_turn_does_to_the_end_of_the_walk() -> None:
     """Against walking the square again with a small steady turn."""
     poses, rate = path(square()), 1e-5
-    expectation = expect(80, poses, [], Drift(1e-9, rate))
+    expectation = expect(80, poses, [], Drift(1e-9, 1e-9, rate))
     steps = np.diff(square(), axis=0)
     turned = np.cumsum(np.linalg.norm(steps, axis=1)) * rate - 0.25 * rate
     rotated = np.c_[steps[:, 0] - turned * steps[:, 1], steps[:, 1] + turned * steps[:, 0]]
@@ -60,12 +60,24 @@ def test_what_odometry_expects_is_no_deviation_and_a_sigma_off_is_one() -> None:
     poses = path(square())
     expectation = expect(80, poses, [], DRIFT)
     exact = lie.inverse(poses[0]) @ poses[80]
-    assert expectation.mahalanobis(0, exact) == pytest.approx(0.0, abs=1e-9)
-    up = exact.copy()
-    up[2, 3] += np.hypot(DRIFT.translation * 40.0, POSITION_M)
-    assert expectation.mahalanobis(0, up) == pytest.approx(1.0, rel=1e-3)
+    assert expectation.deviation(0, exact) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    lower = exact.copy()
+    sigma = np.hypot(DRIFT.height * 40.0, POSITION_M)
+    lower[2, 3] -= sigma
+    assert expectation.deviation(0, lower) == pytest.approx((1.0, 1.0, -sigma), rel=1e-3)
     tilted = lie.transform(lie.exp(np.array([2 * ROTATION, 0.0, 0.0])), np.zeros(3)) @ exact
-    assert expectation.mahalanobis(0, tilted) == pytest.approx(2.0, rel=1e-3)
+    assert expectation.deviation(0, tilted) == pytest.approx((2.0, 0.0, 0.0), rel=1e-3, abs=1e-9)
+
+
+def test_gravity_knows_the_height_better_than_the_place() -> None:
+    poses = path(square())
+    expectation = expect(80, poses, [], replace(DRIFT, rotation=0.0))
+    exact = lie.inverse(poses[0]) @ poses[80]
+    beside, above = exact.copy(), exact.copy()
+    beside[0, 3] += 0.5
+    above[2, 3] += 0.5
+    assert expectation.deviation(0, beside).sigmas == pytest.approx(0.5 / np.hypot(0.4, POSITION_M), rel=1e-3)
+    assert expectation.deviation(0, above).sigmas == pytest.approx(0.5 / np.hypot(0.08, POSITION_M), rel=1e-3)
 
 
 def test_a_loop_that_leaves_a_direction_open_is_no_short_cut() -> None:

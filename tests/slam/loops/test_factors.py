@@ -23,12 +23,15 @@ def keyframe(x: float, drift: float = 0.0) -> Keyframe:
 
 @pytest.mark.parametrize("walked", [0.0, 1.0, 4.0])
 def test_a_step_is_as_certain_as_both_matches_and_the_drift_on_its_way(walked: float) -> None:
-    step = odometry_factor(1, keyframe(0.0), keyframe(walked), Drift(0.01, 0.0))
-    expected = 2 * SIGMA_M**2 + STILL_M**2 + 0.01**2 * walked * EVEN_M
-    np.testing.assert_allclose(np.diag(step.covariance)[3:], expected)
+    step = odometry_factor(1, keyframe(0.0), keyframe(walked), Drift(0.01, 0.002, 0.0))
+    drift = np.array([0.01, 0.01, 0.002])  # the last axis is up
+    expected = 2 * SIGMA_M**2 + STILL_M**2 + drift**2 * walked * EVEN_M
+    np.testing.assert_allclose(step.covariance[3:, 3:], np.diag(expected))
     np.testing.assert_allclose(step.T_first_second[:3, 3], [walked, 0.0, 0.0])
 
 
 def test_a_step_late_in_a_walk_is_as_certain_as_an_early_one() -> None:
-    early, late = (odometry_factor(1, keyframe(0.0, d), keyframe(1.0, d), Drift(0.01, 0.001)) for d in (0.0, 1.0))
+    early, late = (
+        odometry_factor(1, keyframe(0.0, d), keyframe(1.0, d), Drift(0.01, 0.002, 0.001)) for d in (0.0, 1.0)
+    )
     np.testing.assert_array_equal(early.covariance, late.covariance)

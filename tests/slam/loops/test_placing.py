@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from app.slam import lie
+from app.slam.loops.drift import Deviation
 from app.slam.loops.placing import Placement, place
 from app.slam.loops.plan import EVERYWHERE, Window, placements
 from app.slam.loops.verification import Prepared
@@ -36,7 +37,7 @@ def laid(target: Prepared, source: Prepared, guess: F64, window: Window, allowed
         source,
         guess,
         window,
-        lambda T: abs(float(T[0, 3] - guess[0, 3])),
+        lambda T: Deviation(abs(float(T[0, 3] - guess[0, 3])), 0.0, 0.0),
         most_sigmas=allowed_m,
         most_slide=0.05,
     )
@@ -96,7 +97,7 @@ def test_of_two_places_that_fit_odometry_has_the_choice() -> None:
     source = seen(corridor(np.random.default_rng(1), EVEN), np.eye(4))
     found = laid(target, source, pose(3.1, 0.0, 0.0, 0.0), Window(6.0, 0.2), allowed_m=2.0)
     assert found.fit.T_target_source[0, 3] == pytest.approx(4.0, abs=0.05)
-    assert found.deviation < 1.0
+    assert found.deviation.sigmas < 1.0
 
 
 def test_what_is_against_odometry_is_looked_for_beyond_what_odometry_allows() -> None:
@@ -105,7 +106,7 @@ def test_what_is_against_odometry_is_looked_for_beyond_what_odometry_allows() ->
     target = seen(np.vstack([once, once + np.array([6.0, 0.0, 0.36])]), np.eye(4))
     source = seen(square(np.random.default_rng(1)), np.eye(4))
     found = laid(target, source, pose(4.6, 0.0, 0.3, 0.0), Window(2.0, 0.2), allowed_m=1.0)
-    assert found.deviation > 1.0
+    assert found.deviation.sigmas > 1.0
     assert found.alternative_m == pytest.approx(6.0, abs=0.1)
 
 

@@ -227,7 +227,7 @@ SLIPPED = Evidence(overlap=0.8, residual_rms=0.03, slide=0.01, mahalanobis=9.0, 
 def judged(loops: list[LoopEdge], evidence: Evidence = SLIPPED) -> dict[int, LoopEdge]:
     """By their older ends, once all are there; odometry walks as `POSES`."""
     found = {edge.pair: replace(edge, verdict=Verdict.CANDIDATE, evidence=evidence) for edge in loops}
-    settled = settle(found, found, POSES, Drift(0.01, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
+    settled = settle(found, found, POSES, Drift(0.01, 0.002, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
     return {edge.older: edge for edge in settled}
 
 
@@ -275,7 +275,7 @@ def test_an_ambiguous_loop_that_agrees_neither_supports_nor_contradicts() -> Non
     def verdicts(ambiguous: list[LoopEdge]) -> set[Verdict]:
         found = {edge.pair: replace(edge, verdict=Verdict.CANDIDATE, evidence=near) for edge in sure}
         known = found | {edge.pair: replace(edge, verdict=Verdict.REJECTED, evidence=unsure) for edge in ambiguous}
-        settled = settle(found, known, POSES, Drift(0.01, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
+        settled = settle(found, known, POSES, Drift(0.01, 0.002, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
         return {edge.verdict for edge in settled}
 
     assert verdicts([loop(older) for older in (37, 36, 35)]) == {Verdict.ACCEPTED}

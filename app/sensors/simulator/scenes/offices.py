@@ -1,10 +1,10 @@
-"""Storeys of an office building: a loop of corridors, and two wings with a lobby."""
+"""Storeys of an office building: a loop of corridors, two wings with a lobby, and two loops joined by a staircase."""
 
 from itertools import pairwise
 
 import numpy as np
 
-from app.sensors.simulator.mesh import MeshBuilder, line_through
+from app.sensors.simulator.mesh import MeshBuilder, Triple, line_through
 from app.sensors.simulator.raycast import SimulatedScene
 from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.props import Point, grid, rectangle, sides, storey, tiled
@@ -15,6 +15,8 @@ WIDTH = 2.4
 """m, of the corridors."""
 LENGTH, DEPTH, LOBBY = 42.0, 15.0, 6.0
 """m, of `building`."""
+STOREY, STEPS, RUN = 3.3, 10, 0.32
+"""m from floor to floor of `storeys`; steps of each of the two flights between them, and m from step to step."""
 
 
 def corridor(rng: np.random.Generator) -> SimulatedScene:
@@ -74,6 +76,58 @@ def building(rng: np.random.Generator) -> SimulatedScene:
     someone = props.pedestrian(rectangle(1.85, 1.85, middle - 1.85, DEPTH - 1.85)[::-1], 1.1)
     # down the shared corridor twice, once from either wing; then the same lap the other way
     return SimulatedScene(mesh.build(), (someone,), np.array([*lap, *turn, *lap[::-1][:-1]]))
+
+
+def storeys(rng: np.random.Generator) -> SimulatedScene:
+    """Two storeys alike, 46 m a lap, joined by a staircase: a lap below, one above, and another below."""
+    east, north, half = 18.0, 10.0, WIDTH / 2
+    well = rectangle(east, 3.6, east + 5.8, 6.4)
+    one = MeshBuilder()
+    storey(one, rectangle(-4.2, -4.2, east + 0.08, north + 4.2), HEIGHT, 0.6, tiled(0.38), 0.7)
+    south_wall, east_wall, *other_walls = sides(rectangle(0, 0, east, north))
+    for wall in (south_wall, *other_walls):
+        _outer_wall(one, *wall, rng)
+    one.wall(*east_wall, HEIGHT, 0.65, [(4.4, 5.6, 0.0, 2.1)])  # the way to the stairs
+    for wall in sides(rectangle(WIDTH, WIDTH, east - WIDTH, north - WIDTH)):
+        _inner_wall(one, *wall, rng)
+    one.boxes(grid(np.arange(2.5, east, 4.5), (half, north - half), HEIGHT - 0.03), (1.2, 0.3, 0.06), 0.9)
+
+    mesh = MeshBuilder()
+    for floor in (0.0, STOREY):
+        mesh.place(one.build(), (0.0, 0.0, floor))
+    _staircase(mesh, well, STOREY + HEIGHT)
+    lap = [(east - half, 5.0), (east - half, north - half), (half, north - half), (half, half), (east - half, half)]
+    up = [(0.5, 1.4), (0.84, 0.7), (4.04, 0.7), (5.0, 0.9), (5.0, 1.9), (4.36, 2.1), (1.16, 2.1), (0.5, 1.4)]
+    climb = [0.0, 0.0, 0.5, 0.5, 0.5, 0.5, 1.0, 1.0]
+    stairs = np.column_stack([np.array(up) + well[0], np.array(climb) * STOREY])
+    below, above = (np.array([(*at, floor) for at in [*lap, lap[0]]]) for floor in (0.0, STOREY))
+    return SimulatedScene(mesh.build(), (), np.vstack([below, stairs, above, stairs[::-1], below]), closed=False)
+
+
+def _staircase(mesh: MeshBuilder, well: list[Point], top: float) -> None:
+    """Two flights with a landing between them, in a well whose first wall is that of the storeys."""
+    (x, y), (far, _), (_, back), _ = well
+    middle = (y + back) / 2
+    for wall in sides(well)[:3]:
+        mesh.wall(*wall, top, 0.6)
+    for z, shade in ((0.0, 0.4), (top, 0.7)):
+        mesh.quad([(*corner, z) for corner in well], shade, ground=z == 0.0)
+    rise = STOREY / (2 * STEPS)
+    for step in range(STEPS):
+        ahead, behind = x + 1.0 + RUN * (step + 0.5), x + 1.0 + RUN * (STEPS - step - 0.5)
+        _slab(mesh, (ahead, y + 0.7, rise * (step + 1)), (RUN, 1.2, rise))
+        _slab(mesh, (behind, back - 0.7, STOREY / 2 + rise * (step + 1)), (RUN, 1.2, rise))
+    _slab(mesh, (far - 0.8, middle, STOREY / 2), (1.6, back - y, 0.1))
+    _slab(mesh, (x + 0.5, middle, STOREY), (1.0, back - y, 0.1))
+    mesh.box((x + 1.0 + RUN * STEPS / 2, middle, STOREY / 2), (RUN * STEPS, 0.05, 1.0), 0.3)
+
+
+def _slab(mesh: MeshBuilder, top: Triple, size: Triple) -> None:
+    """A box whose top, with its middle at `top`, is floor."""
+    (x, y, z), (length, width, thickness) = top, size
+    mesh.box((x, y, z - thickness / 2 - 0.001), size, 0.5)
+    corners = rectangle(x - length / 2, y - width / 2, x + length / 2, y + width / 2)
+    mesh.quad([(*corner, z) for corner in corners], 0.5, ground=True)
 
 
 def _outer_wall(mesh: MeshBuilder, start: Point, end: Point, rng: np.random.Generator) -> None:
