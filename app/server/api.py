@@ -57,7 +57,7 @@ def _edit(kind: Callable[..., LoopEdit]) -> Callable[..., Command]:
     return lambda **fields: protocol.EditLoop(kind(**fields))
 
 
-Index = Annotated[int, Field(ge=0, lt=10**12)]  # session files hold no longer numbers
+Index = Annotated[int, Field(ge=0, le=10**12 - 1)]  # session files hold no longer numbers
 Count = Annotated[int, Field(ge=1)]
 Weight = Annotated[float, Field(gt=0, description="Divides the loop's covariance.")]
 Registered = Annotated[bool, Field(description="Register the two submaps; false ties them where the graph has them.")]

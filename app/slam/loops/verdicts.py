@@ -131,6 +131,8 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
         where = f"{abs(height):.1f} m {'above' if height > 0 else 'below'} where odometry expects it"
         off = f"{place.deviation.height_sigmas:.1f} σ, most {p.max_mahalanobis:g} σ"
         return f"it lies {where} ({off}), and storeys of a building look alike"
+    if e.mahalanobis > WIDER * p.max_mahalanobis:
+        return e.against_odometry(WIDER * p.max_mahalanobis)
     if place.loose:
         most = f"most {1000 * p.max_slide:.0f} mm"
         return f"it slides in all directions: pushed, it ends {1000 * e.slide:.0f} mm off ({most})"

@@ -78,6 +78,15 @@ def test_corridors_and_rooms_that_repeat_make_no_false_loop() -> None:
     assert errors[:, 1].max() < 2.0
 
 
+def test_flats_that_look_alike_stay_beside_one_another_even_if_odometry_drifts_more_than_it_may() -> None:
+    walk = take("flats", 185.0)
+    backend = drive(walk.drifted(0.05, -0.1), PARAMS)
+    errors = np.array([error(edge, walk.truth) for edge in accepted(backend)])
+    assert len(errors) > 50, "true revisits are found all the same"
+    assert errors[:, 0].max() < 1.0, "the next flat is 7 m away"
+    assert any("odometry rules it out" in edge.reason and edge.evidence.overlap > 0.8 for edge in backend.edges)
+
+
 def test_storeys_that_look_alike_stay_above_one_another() -> None:
     walk = take("storeys", 155.0)
     backend = drive(walk.drifted(0.01, 0.02), PARAMS)

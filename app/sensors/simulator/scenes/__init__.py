@@ -10,13 +10,13 @@ from app.sensors.simulator.scenes.cloister import cloister
 from app.sensors.simulator.scenes.museum import museum
 from app.sensors.simulator.scenes.offices import building, corridor, storeys
 from app.sensors.simulator.scenes.outdoors import outdoor, outdoor_1, outdoor_2, outdoor_3, outdoor_4
-from app.sensors.simulator.scenes.rooms import identical, indoor_1, indoor_2, room
+from app.sensors.simulator.scenes.rooms import flats, identical, indoor_1, indoor_2, room
 from app.slam.errors import HemislamError
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], SimulatedScene]] = {
     builder.__name__: builder
     for builder in (
-        *(corridor, room, outdoor, museum, cloister, building, storeys, identical),
+        *(corridor, room, outdoor, museum, cloister, building, storeys, flats, identical),
         *(indoor_1, indoor_2, outdoor_1, outdoor_2, outdoor_3, outdoor_4),
     )
 }

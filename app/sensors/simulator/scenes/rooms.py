@@ -1,4 +1,4 @@
-"""Rooms: one furnished, a garage and an office as in the paper, and a trap with twins of every room and corridor."""
+"""Rooms: one furnished, a garage and an office as in the paper, and two traps: equal corridors and equal flats."""
 
 import numpy as np
 
@@ -13,6 +13,8 @@ PITCH, CORRIDORS = 6.0, 5
 """Distance between the middles of neighbouring corridors, m, and how many there are."""
 BAY, BAYS = 4.0, 4
 """Distance from door to door along a corridor, m, and how many there are on either side."""
+FLAT, FLATS, FLAT_DEPTH = 7.0, 3, 9.0
+"""Width of each of the `flats`, how many there are, and their depth, m."""
 
 
 def room(rng: np.random.Generator) -> SimulatedScene:
@@ -145,6 +147,42 @@ def identical(rng: np.random.Generator) -> SimulatedScene:
         path += [(x, y) for y in (ends if c % 2 == 0 else ends[::-1])]
     # the last corridor ends in the north: back along the north aisle and down the first corridor
     return SimulatedScene(mesh.build(), (), np.array([*path, (0.0, far)]))
+
+
+def flats(rng: np.random.Generator) -> SimulatedScene:
+    """Three equal flats in a row, furnished alike, each toured twice, then the first again; a gallery joins them."""
+    one, width = MeshBuilder(), FLATS * FLAT
+    for wall, openings in (
+        (((0.0, 0.0), (FLAT, 0.0)), [(0.8, 2.4, 0.0, 2.1), (3.6, 5.4, 0.9, 2.2)]),
+        (((0.0, FLAT_DEPTH), (FLAT, FLAT_DEPTH)), [(0.8, 2.4, 0.9, 2.2), (4.2, 6.0, 0.2, 2.2)]),
+        (((0.0, 4.6), (FLAT, 4.6)), [(4.6, 6.2, 0.0, 2.1)]),
+        (((2.8, 4.6), (2.8, FLAT_DEPTH)), [(1.9, 3.5, 0.0, 2.1)]),
+        (((FLAT, 0.0), (FLAT, FLAT_DEPTH)), []),
+    ):
+        one.wall(*wall, HEIGHT, 0.6, openings, thickness=0.12)
+    props.table(one, (5.3, 1.6, 0.0), 0.2)
+    for x, yaw in ((4.5, 0.1), (6.2, 3.0)):
+        props.chair(one, (x, 1.4, 0.0), yaw)
+    props.shelf(one, (0.3, 2.8, 0.0), 0.0, rng)
+    props.sofa(one, (3.6, 8.2, 0.0), -np.pi / 2)
+    props.plant(one, (6.5, 4.0, 0.0), rng)
+    one.box((0.8, 8.4, 0.3), (1.4, 1.0, 0.6), 0.5)
+    one.box((1.3, 5.0, 1.0), (1.2, 0.6, 2.0), 0.6)
+
+    mesh = MeshBuilder()
+    storey(mesh, rectangle(-3.0, -2.2, width + 3.0, FLAT_DEPTH), HEIGHT, 0.5, tiled(0.4), 0.7)
+    flat = one.build()
+    for index in range(FLATS):
+        mesh.place(flat, (index * FLAT, 0.0, 0.0))
+    mesh.wall((0.0, 0.0), (0.0, FLAT_DEPTH), HEIGHT, 0.6)
+    mesh.wall((-3.0, -2.2), (width + 3.0, -2.2), 1.0, 0.5)
+    outside, tour = (
+        (1.6, -1.1),
+        [(1.6, 1.4), (3.6, 3.1), (5.4, 3.6), (5.4, 6.4), (2.1, 7.2), (5.4, 6.6), (5.4, 3.4), (3.2, 2.9)],
+    )
+    visit = [outside, *tour, *tour, (1.6, 1.2), outside]
+    rooms = [(x + index * FLAT, y) for index in (*range(FLATS), 0) for x, y in visit]
+    return SimulatedScene(mesh.build(), (), np.array([(-2.0, -1.1), *rooms]), closed=False)
 
 
 def _bay(mesh: MeshBuilder, x: float, side: float, y: float) -> None:
