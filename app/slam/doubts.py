@@ -25,6 +25,9 @@ to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a 
 20 ms leave 0.07 to 0.4."""
 OFTEN = 3
 """Of frames in which the sensors contradict each other, or in which none shows the motion, so many are doubtful."""
+BLANK_S = 1.5
+"""s without scans and without IMU samples after which nobody knows how far the device moved; 1 s is bridged to
+centimetres."""
 LATE_S = 0.01
 """How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
 
@@ -47,7 +50,19 @@ def doubts(log: RunLog) -> tuple[str, ...]:
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
     of_sensors = _of_imu(log) or _of_surprise(log, times)  # a wrong mounting surprises as well
-    return (*found, *_of_silence(log, times), *_of_clock(log), *of_sensors)
+    return (*found, *_of_pauses(log, times), *_of_silence(log, times), *_of_clock(log), *of_sensors)
+
+
+def _of_pauses(log: RunLog, times: F64) -> list[str]:
+    """Whether scans and IMU were away at the same time, as when the recorder was paused."""
+    waited = np.diff(times, prepend=times[:1])
+    blank = (waited > BLANK_S) & (log.readout("imu_gap_s") > BLANK_S)
+    if not blank.any():
+        return []
+    return [
+        f"There are neither scans nor IMU samples for {waited[blank].max():.1f} s{_since(times - waited, blank)}; how "
+        "the device moved meanwhile is a guess, so the map may be metres off from then on."
+    ]
 
 
 def _of_silence(log: RunLog, times: F64) -> list[str]:

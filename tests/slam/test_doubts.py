@@ -64,6 +64,17 @@ def test_a_few_frames_in_which_neither_sensor_shows_the_motion_are_reported(gap_
     assert all("first at 2.0 s" in doubt for doubt in found)
 
 
+@pytest.mark.parametrize(("imu_gap_s", "told"), [(0.005, False), (2.0, True)])
+def test_a_recorder_that_was_paused_is_reported_if_the_imu_does_not_tell_the_way_either(
+    imu_gap_s: float, told: bool
+) -> None:
+    whole = log(WALK, imu_gap_s=imu_gap_s)
+    paused = RunLog([*whole.frames[:50], *whole.frames[70:]])
+    assert doubts(whole) == ()
+    assert len(found := doubts(paused)) == told
+    assert all("neither scans nor IMU samples for 2.1 s, first at 4.9 s;" in doubt for doubt in found)
+
+
 def test_a_walk_of_which_most_scans_were_dropped_is_reported() -> None:
     (doubt,) = doubts(log(WALK, dropped=300))
     assert doubt == "300 of 500 scans were dropped, mostly because it was dark."
