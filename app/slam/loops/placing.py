@@ -51,16 +51,18 @@ def place(
     deviation: Callable[[F64], Deviation],
     most_sigmas: float,
     most_slide: float,
+    *,
+    height_known: bool = False,
 ) -> Placement:
     """Align a submap with another.
 
-    If the best alignment contradicts odometry, odometry cannot rule out others either: they are looked for everywhere,
-    but not if its height does, since that follows from the ground and would be the same elsewhere.
+    If the best alignment contradicts odometry, odometry cannot rule out others either: they are looked for everywhere.
 
     Args:
         T_guess: (4, 4) of the level frames, by odometry; along a direction that is open, the result stays there.
         deviation: of such a transform from odometry. most_sigmas: standard deviations up to which it is allowed.
-        most_slide: m, up to which a direction holds.
+        most_slide: m, up to which a direction holds. height_known: an alignment at another height is wrong; others are
+            not looked for then, since their height would follow from the same ground.
     """
     starts = [T_guess, *(placements(target, source, T_guess, window) if window.reach_m >= APART_M else ())]
     found: list[F64] = []
@@ -79,7 +81,8 @@ def place(
         chosen, others = found[0], []
     fit = assess(target, source, refine(target, source, chosen))
     off = deviation(fit.T_target_source)
-    if window is not EVERYWHERE and off.sigmas > most_sigmas >= off.height_sigmas:
+    wrong = height_known and off.height_sigmas > most_sigmas
+    if window is not EVERYWHERE and off.sigmas > most_sigmas and not wrong:
         return place(target, source, T_guess, EVERYWHERE, deviation, most_sigmas, most_slide)
 
     weakest, second, _ = fit.directions

@@ -201,7 +201,9 @@ class Search:
         """Candidates with a verdict on each alone."""
         out: list[LoopEdge] = []
         for sighting in self.detector.look(newer, expectation, params):
-            out.append(judge(sighting, self.detector, expectation, params))
+            between = [index for index in self._loose if sighting.older < index <= newer]
+            broken = any(slips.is_break(self.detector.slip(index)) for index in between)
+            out.append(judge(sighting, self.detector, expectation, params, broken=broken))
             if out[-1].verdict is Verdict.CANDIDATE and out[-1].evidence.gate_m < SURE_M:
                 break
         return out

@@ -16,8 +16,15 @@ POINT_M, INDEPENDENT = 0.03, 0.05
 """Standard deviation of a point's distance to a plane seen moments before; share of points with independent errors."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.25)
 """Smallest standard deviations of such a registration, however many points it has."""
+BREAK_M, BREAK_RAD = 1.0, np.radians(15.0)
+"""A slip larger than this is a break. Odometry that drifts a lot slips at every step, but by less."""
 LIKELY = 2.5
 """Largest deviation, in standard deviations, at which odometry still counts as right."""
+
+
+def is_break(slip: F64 | None) -> bool:
+    """Whether a slip (6,) is so large that odometry is no evidence across it."""
+    return slip is not None and bool(np.linalg.norm(slip[:3]) > BREAK_RAD or np.linalg.norm(slip[3:]) > BREAK_M)
 
 
 def slip(before: Prepared, after: Prepared, T_guess: F64) -> F64 | None:

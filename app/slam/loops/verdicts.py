@@ -30,8 +30,14 @@ POINT_M, INDEPENDENT = 0.1, 0.05
 errors are independent of their neighbours'."""
 
 
-def judge(sighting: Sighting, detector: Detector, expectation: Expectation, params: LoopsParams) -> LoopEdge:
-    """Register a sighting and check it against the limits: a candidate if it meets all, else rejected."""
+def judge(
+    sighting: Sighting, detector: Detector, expectation: Expectation, params: LoopsParams, *, broken: bool
+) -> LoopEdge:
+    """Register a sighting and check it against the limits: a candidate if it meets all, else rejected.
+
+    Args:
+        broken: whether odometry broke between the two; only then may loops outvote it however far off it is.
+    """
     older, newer = sighting.older, sighting.newer
     guess = detector.guess(older, newer, expectation.poses)
     sigma = float(expectation.position_sigmas()[older])
@@ -48,7 +54,7 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
         )
         return edge(_imu(detector, older, newer, guess), np.eye(6), evidence, reason)
 
-    found = _place(older, newer, detector, expectation, params)
+    found = _place(older, newer, detector, expectation, params, height_known=not broken)
     fit = found.fit
     evidence = replace(
         evidence,
@@ -60,11 +66,18 @@ def judge(sighting: Sighting, detector: Detector, expectation: Expectation, para
         mahalanobis=found.deviation.sigmas,
     )
     T = _imu(detector, older, newer, fit.T_target_source)
-    return edge(T, covariance(detector, newer, fit, found.open), evidence, _objection(found, evidence, params))
+    reason = _objection(found, evidence, params) or ("" if broken else _far_off(found.deviation, evidence, params))
+    return edge(T, covariance(detector, newer, fit, found.open), evidence, reason)
 
 
 def _place(
-    older: KeyframeId, newer: KeyframeId, detector: Detector, expectation: Expectation, params: LoopsParams
+    older: KeyframeId,
+    newer: KeyframeId,
+    detector: Detector,
+    expectation: Expectation,
+    params: LoopsParams,
+    *,
+    height_known: bool = False,
 ) -> Placement:
     """The alignment of the newer place with the older one, searched as far as odometry may be off."""
 
@@ -75,7 +88,8 @@ def _place(
     reach = WIDER * params.max_mahalanobis
     window = Window(reach * sigma if sigma > SURE_M else 0.0, reach * np.sqrt(expectation.covariance(older)[2, 2]))
     guess = detector.guess(older, newer, expectation.poses)
-    return place(*detector.both(older, newer), guess, window, deviation, params.max_mahalanobis, params.max_slide)
+    limits = params.max_mahalanobis, params.max_slide
+    return place(*detector.both(older, newer), guess, window, deviation, *limits, height_known=height_known)
 
 
 def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
@@ -126,13 +140,6 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
         return f"the submaps overlap by {100 * e.overlap:.0f} % (least {100 * p.min_overlap:.0f} %)"
     if e.residual_rms > p.max_residual:
         return f"the residual is {1000 * e.residual_rms:.0f} mm (most {1000 * p.max_residual:.0f} mm)"
-    if place.deviation.height_sigmas > p.max_mahalanobis:
-        height = place.deviation.height
-        where = f"{abs(height):.1f} m {'above' if height > 0 else 'below'} where odometry expects it"
-        off = f"{place.deviation.height_sigmas:.1f} σ, most {p.max_mahalanobis:g} σ"
-        return f"it lies {where} ({off}), and storeys of a building look alike"
-    if e.mahalanobis > WIDER * p.max_mahalanobis:
-        return e.against_odometry(WIDER * p.max_mahalanobis)
     if place.loose:
         most = f"most {1000 * p.max_slide:.0f} mm"
         return f"it slides in all directions: pushed, it ends {1000 * e.slide:.0f} mm off ({most})"
@@ -141,6 +148,19 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
         return f"it is ambiguous: {away} it fits as well, and odometry (σ {e.gate_m:.2f} m) allows both"
     if place.open is not None and e.mahalanobis > p.max_mahalanobis:
         return f"it slides, and {e.against_odometry(p.max_mahalanobis)}"
+    return ""
+
+
+def _far_off(deviation: Deviation, e: Evidence, p: LoopsParams) -> str:
+    """Why odometry that did not break rules a loop out, however many others agree with it; "" if it does not."""
+    if deviation.height_sigmas > p.max_mahalanobis:
+        where = (
+            f"{abs(deviation.height):.1f} m {'above' if deviation.height > 0 else 'below'} where odometry expects it"
+        )
+        off = f"{deviation.height_sigmas:.1f} σ, most {p.max_mahalanobis:g} σ"
+        return f"it lies {where} ({off}), and storeys of a building look alike"
+    if e.mahalanobis > WIDER * p.max_mahalanobis:
+        return e.against_odometry(WIDER * p.max_mahalanobis)
     return ""
 
 

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.backend import LoopBackend
@@ -98,6 +99,19 @@ def test_storeys_that_look_alike_stay_above_one_another() -> None:
     found = {edge.newer for edge in loops}
     assert np.mean([index in found for index in revisits(walk)]) > 0.6
     assert any("storeys of a building look alike" in edge.reason for edge in backend.edges)
+
+
+def test_where_odometry_was_seen_to_break_loops_outvote_it_however_far_off_it_is(walked: Walked) -> None:
+    keyframes, at = walked.walk.drifted(0.003, 0.005), 20
+    here = lie.transform(np.eye(3), keyframes[at].T_odom_imu[:3, 3])
+    leap = lie.transform(lie.exp(np.array([0.0, 0.0, np.radians(20.0)])), np.array([0.6, -0.3, 0.8]))
+    broken = [
+        replace(k, T_odom_imu=here @ leap @ lie.inverse(here) @ k.T_odom_imu) if k.index >= at else k for k in keyframes
+    ]
+    backend = drive(tuple(broken), PARAMS)
+    across = [edge for edge in accepted(backend) if edge.older < at - PARAMS.submap_keyframes]
+    assert any(edge.evidence.mahalanobis > 4 * PARAMS.max_mahalanobis for edge in across)
+    assert max(error(edge, walked.walk.truth)[0] for edge in across) < 0.1
 
 
 # --- history -------------------------------------------------------------------------------------

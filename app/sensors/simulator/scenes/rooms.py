@@ -176,11 +176,8 @@ def flats(rng: np.random.Generator) -> SimulatedScene:
         mesh.place(flat, (index * FLAT, 0.0, 0.0))
     mesh.wall((0.0, 0.0), (0.0, FLAT_DEPTH), HEIGHT, 0.6)
     mesh.wall((-3.0, -2.2), (width + 3.0, -2.2), 1.0, 0.5)
-    outside, tour = (
-        (1.6, -1.1),
-        [(1.6, 1.4), (3.6, 3.1), (5.4, 3.6), (5.4, 6.4), (2.1, 7.2), (5.4, 6.6), (5.4, 3.4), (3.2, 2.9)],
-    )
-    visit = [outside, *tour, *tour, (1.6, 1.2), outside]
+    tour = [(1.6, 1.4), (3.6, 3.1), (5.4, 3.6), (5.4, 6.4), (2.1, 7.2), (5.4, 6.6), (5.4, 3.4), (3.2, 2.9)]
+    visit = [(1.6, -1.1), *tour, *tour, (1.6, 1.2), (1.6, -1.1)]
     rooms = [(x + index * FLAT, y) for index in (*range(FLATS), 0) for x, y in visit]
     return SimulatedScene(mesh.build(), (), np.array([(-2.0, -1.1), *rooms]), closed=False)
 
