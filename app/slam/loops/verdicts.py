@@ -154,11 +154,9 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
 def _far_off(deviation: Deviation, e: Evidence, p: LoopsParams) -> str:
     """Why odometry that did not break rules a loop out, however many others agree with it; "" if it does not."""
     if deviation.height_sigmas > p.max_mahalanobis:
-        where = (
-            f"{abs(deviation.height):.1f} m {'above' if deviation.height > 0 else 'below'} where odometry expects it"
-        )
+        away = f"{abs(deviation.height):.1f} m {'above' if deviation.height > 0 else 'below'}"
         off = f"{deviation.height_sigmas:.1f} σ, most {p.max_mahalanobis:g} σ"
-        return f"it lies {where} ({off}), and storeys of a building look alike"
+        return f"it lies {away} where odometry expects it ({off}), and storeys of a building look alike"
     if e.mahalanobis > WIDER * p.max_mahalanobis:
         return e.against_odometry(WIDER * p.max_mahalanobis)
     return ""
