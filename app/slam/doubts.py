@@ -54,9 +54,9 @@ def doubts(log: RunLog) -> tuple[str, ...]:
 
 
 def _of_pauses(log: RunLog, times: F64) -> list[str]:
-    """Whether scans and IMU were away at the same time, as when the recorder was paused."""
-    waited = np.diff(times, prepend=times[:1])
-    blank = (waited > BLANK_S) & (log.readout("imu_gap_s") > BLANK_S)
+    """Whether there was neither a scan nor an IMU sample for a while, as when the recorder was paused."""
+    waited, gap = np.diff(times, prepend=times[:1]), log.readout("imu_gap_s")
+    blank = (waited > BLANK_S) & ((gap > BLANK_S) | (gap == 0))  # 0: there was no sample at all
     if not blank.any():
         return []
     return [

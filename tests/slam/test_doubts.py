@@ -64,7 +64,7 @@ def test_a_few_frames_in_which_neither_sensor_shows_the_motion_are_reported(gap_
     assert all("first at 2.0 s" in doubt for doubt in found)
 
 
-@pytest.mark.parametrize(("imu_gap_s", "told"), [(0.005, False), (2.0, True)])
+@pytest.mark.parametrize(("imu_gap_s", "told"), [(0.005, False), (2.0, True), (0.0, True)])
 def test_a_recorder_that_was_paused_is_reported_if_the_imu_does_not_tell_the_way_either(
     imu_gap_s: float, told: bool
 ) -> None:
