@@ -54,7 +54,7 @@ class Site:
 
     def begin(self) -> None:
         self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
-        self.workers = [self.worker() for _ in range(3)]
+        self.workers = [self.worker() for _ in range(2)]
 
     def stop(self) -> None:
         for process in (*self.workers, self.scheduler):
@@ -92,7 +92,7 @@ def test_a_cluster_gives_the_tables_of_one_machine_though_processes_die(
 ) -> None:
     """A worker is killed when the first run has come, and everything is restarted when the second has."""
     kept, keep = list[str](), cluster._keep
-    monkeypatch.setattr(cluster, "CONNECT_S", 3.0)
+    monkeypatch.setattr(cluster, "TAKE_S", 2.0)
 
     def keep_and_kill(job: Job, files: dict[str, bytes]) -> None:
         keep(job, files)
@@ -100,7 +100,8 @@ def test_a_cluster_gives_the_tables_of_one_machine_though_processes_die(
         if len(kept) == 1:
             site.workers[0].send_signal(signal.SIGKILL)
         elif len(kept) == 2:
-            site.restart(after_s=8.0)
+            monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
+            site.restart(after_s=2.5)  # one attempt to connect fails, at least
 
     monkeypatch.setattr(cluster, "_keep", keep_and_kill)
     result = evaluate(recording, tmp_path / "cluster", "--cluster", site.address)
