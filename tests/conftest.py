@@ -1,6 +1,7 @@
 """What all tests share: the recordings beside the project, and what a bare machine may lack."""
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,11 +9,17 @@ from pathlib import Path
 # do not depend on their number is tested in slam/test_engine_repeats.py and recordings/test_odometry.py.
 os.environ.update({f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")})
 
+# Containers often set it. Each process that the tests start would then compile the program anew, and each worker the
+# tests.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 import pytest
 from hypothesis import settings
 
 from app.child import fork_context
 from app.slam.errors import HemislamError
+
+sys.dont_write_bytecode = False  # of this process, as above
 
 # The same examples on every run, and no verdict by the clock.
 settings.register_profile("hemislam", deadline=None, derandomize=True, max_examples=50)
