@@ -29,8 +29,9 @@ def sent(params: Params) -> list[captures.Entry]:
         return [(one.time_ns, PORTS[one.stream], one.data) for one in packets_of(recording, SECONDS)]
 
 
-def walked(path: Path, params: Params) -> np.ndarray:
-    """(n, 3) positions at the ends of scans."""
+def walked(sent: list[captures.Entry], path: Path, params: Params) -> np.ndarray:
+    """(n, 3) positions at the ends of scans, of a capture that is written to `path`."""
+    path.write_bytes(captures.pcap(sent))
     engine = Engine(params)
     with open_recording(path, params) as recording:
         found = (entry for entry in recording.measurements(0.0, SECONDS) if isinstance(entry, Measurement))
@@ -39,9 +40,15 @@ def walked(path: Path, params: Params) -> np.ndarray:
     return np.array(positions)
 
 
+@pytest.fixture(scope="module")
+def whole(params: Params, sent: list[captures.Entry], tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    """Of the walk without losses."""
+    return walked(sent, tmp_path_factory.mktemp("whole") / "whole.pcap", params)
+
+
 @pytest.mark.parametrize(("share", "apart_m"), [(0.01, 0.01), (0.1, 0.03)])
 def test_the_map_is_right_though_packets_are_lost_doubled_and_overtaken(
-    params: Params, sent: list[captures.Entry], tmp_path: Path, share: float, apart_m: float
+    params: Params, sent: list[captures.Entry], whole: np.ndarray, tmp_path: Path, share: float, apart_m: float
 ) -> None:
     """Of the LiDAR's packets; as many are doubled and swapped with the next one as are lost."""
     rng = np.random.default_rng(3)
@@ -55,12 +62,7 @@ def test_the_map_is_right_though_packets_are_lost_doubled_and_overtaken(
             arrived.insert(len(arrived) - 1, entry)
     missing = {packet for _, port, packet in sent if port == PORTS[0]} - {packet for *_, packet in arrived}
     assert 0.8 * share < len(missing) / len(sent) < share
-    positions = []
-    for name, entries in (("whole", sent), ("bad", arrived)):
-        path = tmp_path / f"{name}.pcap"
-        path.write_bytes(captures.pcap(entries))
-        positions.append(walked(path, params))
-    whole, bad = positions
+    bad = walked(arrived, tmp_path / "bad.pcap", params)
     assert len(bad) == len(whole) > 70
     assert np.linalg.norm(whole - whole[0], axis=1).max() > 1.0
     away = np.linalg.norm(bad - whole, axis=1).max()
