@@ -2,8 +2,10 @@
 
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
+import httpx
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -14,6 +16,14 @@ from server_site import Site, engine_recording, serving
 from app.server.setup import Setup
 from app.server.viser_adapter import Viser, start_viser
 from app.server.worker import EngineProcess
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _certificates_read_once() -> Iterator[None]:
+    """httpx would read the certificates of the world's authorities for each request, which takes 27 ms."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(httpx._transports.default, "create_ssl_context", cache(httpx.create_ssl_context))
+        yield
 
 
 @pytest.fixture(scope="module")
