@@ -4,11 +4,13 @@ import asyncio
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 import viser
+import viser._icons
 from viser._messages import GuiUpdateMessage
 
 from app.server.protocol import Command, Snapshot, StepFrame
@@ -79,6 +81,15 @@ def clouds(server: viser.ViserServer) -> dict[str, Cloud]:
             for prop in set(Cloud.__slots__) & told.keys():
                 setattr(found[name], prop, told[prop])
     return found
+
+
+@pytest.fixture(scope="session", autouse=True)
+def icons_read_once() -> Iterator[None]:
+    """viser keeps 32 of them. A workbench has more, so each would read them from their archive, for half a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("viser._gui_api", "viser._gui_handles"):
+            patch.setattr(f"{module}.svg_from_icon", cache(viser._icons.svg_from_icon))
+        yield
 
 
 @pytest.fixture(scope="session")
