@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from app.server.folders import Folders
 from app.ui.workbench import Workbench
+from tests.ui.conftest import icons_read_once  # noqa: F401 - a fixture
 from tests.ui.fake_engine import FakeEngine
 
 ARGS = (
