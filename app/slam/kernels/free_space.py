@@ -102,10 +102,9 @@ def vote(points, first, T, size, image, margin, slack, most_hits, through, hits)
         for i in range(a - 1, a + 2):
             for j in range(b - 1, b + 2):
                 near, far = image[i, j, NEAR], image[i, j, FAR]
-                if far == 0.0:
-                    continue
-                seen = True
-                hit |= low < near < high or low < far < high
+                # without branches, which would be hard to predict; an empty bin is neither a hit nor blocked
+                hit |= ((low < near) & (near < high)) | ((low < far) & (far < high))
+                seen |= far > 0.0
                 blocked |= near < high
         if hit:
             hits[k] += 1
