@@ -54,7 +54,8 @@ class Deserialiser:
         if kind in CUSTOM_MSGS:
             return CustomMsg.of(data, encoding)
         store = self._stores[encoding]
-        return store.deserialize_ros1(data, kind) if encoding == "ros1" else store.deserialize_cdr(data, kind)
+        view = memoryview(data)  # the library slices it, which would copy every cloud
+        return store.deserialize_ros1(view, kind) if encoding == "ros1" else store.deserialize_cdr(view, kind)
 
 
 def ros2_type(name: str) -> str:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -313,7 +314,7 @@ class Sequencer:
         interval = scan.stamp_ns - self._last_stamp_ns
         # at first only the scan itself shows how often scans come
         lasts = max(scan.end_ns - scan.stamp_ns, 100_000_000)
-        usual = float(np.median(self._intervals_ns)) if len(self._intervals_ns) >= 5 else lasts
+        usual = median(self._intervals_ns) if len(self._intervals_ns) >= 5 else lasts
         if interval > 1.5 * usual:
             missing = round(interval / usual) - 1
             self._notices.append(f"no usable scan for {interval / 1e9:.3f} s before this one ({missing} missing)")

@@ -5,6 +5,8 @@ LONGEST = 2000
 
 def printable(text: str) -> str:
     """A text from outside, with characters that would drive a terminal or break the line shown as escapes."""
+    if text.isprintable():
+        return text
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 
 
