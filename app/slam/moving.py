@@ -98,5 +98,6 @@ def _near(places: F32, others: F32) -> I32:
     """How many of the others are in the surroundings of each place."""
     if not len(places) or not len(others):
         return np.zeros(len(places), np.int32)
-    tree: Any = KDTree(others)  # type: ignore[no-untyped-call]  # scipy ships no types
+    # asked once, so it is to be built fast
+    tree: Any = KDTree(others, 24, compact_nodes=False, balanced_tree=False)  # type: ignore[no-untyped-call]  # no types
     return np.asarray(tree.query_ball_point(places, NEIGHBOURHOOD, return_length=True), np.int32)
