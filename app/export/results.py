@@ -26,7 +26,7 @@ from app.slam import report
 from app.slam.errors import HemislamError
 from app.slam.loops.files import LoopResults, loops_csv
 from app.slam.loops.types import Verdict
-from app.slam.map_frame import MapFrame
+from app.slam.map_frame import NO_PAUSES, MapFrame
 from app.slam.ply import Keyframes
 from app.slam.provenance import hash_input
 from app.slam.run_log import RunInfo, RunLog
@@ -177,7 +177,8 @@ def _write_graph(path: Path, results: Results) -> None:
 
 def _write_report(path: Path, results: Results) -> None:
     loops, info = results.loops, results.info
-    made = report.make_report(results.log, results.trajectory, info, results._sha256.result())
+    tied_ns = loops.tied_ns if loops else NO_PAUSES
+    made = report.make_report(results.log, results.trajectory, info, results._sha256.result(), tied_ns)
     made |= {"map": results.report.get("map"), "levelled_deg": round(results.levelled_deg, 4)}
     if results.found is not None or results.problem:
         made["georeference"] = ledger.report(results.found) if results.found else {"problem": results.problem}

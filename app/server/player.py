@@ -15,6 +15,7 @@ from app.server.protocol import Progress
 from app.server.publisher import Publisher, opened_recording
 from app.slam.doubts import IN_DOUBT, doubts
 from app.slam.errors import HemislamError
+from app.slam.map_frame import NO_PAUSES
 from app.slam.types import DroppedScan, StepResult
 
 log = logging.getLogger(__name__)
@@ -259,7 +260,7 @@ class Player:
 
     def _doubt(self, session: Session) -> None:
         """Say why the run cannot be right, each reason once."""
-        for doubt in doubts(session.log):
+        for doubt in doubts(session.log, session.loops.tied_ns if session.loops else NO_PAUSES):
             reason = re.sub(r"[\d.]+", "#", doubt)
             if reason not in self._doubted:
                 self._doubted.add(reason)

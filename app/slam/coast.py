@@ -114,6 +114,15 @@ def standing(stamp_ns: int, R_odom_imu: F64, params: Params) -> Belief:
     return Belief(state, np.diag(sigma**2))
 
 
+def without_imu(belief: Belief) -> Belief:
+    """The belief where the rate of turn is unknown and gravity is known, as at the begin."""
+    covariance = belief.covariance.copy()
+    for part, sigma in ((BG, FIRST_RATE), (GRAV, 1e-3)):
+        covariance[part] = covariance[:, part] = 0.0
+        covariance[part, part] = sigma**2 * np.eye(part.stop - part.start)
+    return Belief(replace(belief.state, b_gyro=np.zeros(3)), covariance)
+
+
 def propagate(belief: Belief, end_ns: int, course: Course, changes: tuple[float, float] = CHANGES) -> Belief:
     """Carry the belief forward to `end_ns` along the course.
 

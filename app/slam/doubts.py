@@ -4,8 +4,10 @@ import numpy as np
 
 from app.slam import iekf
 from app.slam.imu import LONG_GAP
+from app.slam.map_frame import NO_PAUSES
+from app.slam.pause import PAUSE_S
 from app.slam.run_log import RunLog
-from app.slam.types import F64, FrameStatus
+from app.slam.types import F64, I64, FrameStatus
 
 IN_DOUBT = "This run is doubtful."
 """How a notice about a doubt begins."""
@@ -25,15 +27,16 @@ to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a 
 20 ms leave 0.07 to 0.4."""
 OFTEN = 3
 """Of frames in which the sensors contradict each other, or in which none shows the motion, so many are doubtful."""
-BLANK_S = 1.5
-"""s without scans and without IMU samples after which nobody knows how far the device moved; 1 s is bridged to
-centimetres."""
 LATE_S = 0.01
 """How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
 
 
-def doubts(log: RunLog) -> tuple[str, ...]:
-    """Why the trajectory cannot be right, a sentence each, with where it begins; empty if nothing speaks against it."""
+def doubts(log: RunLog, tied_ns: I64 = NO_PAUSES) -> tuple[str, ...]:
+    """Why the trajectory cannot be right, a sentence each, with where it begins; empty if nothing speaks against it.
+
+    Args:
+        tied_ns: (m,) ends of the pauses that loops span (`tied_pauses`).
+    """
     found = []
     positions, times = log.odometry.positions, np.asarray((log.stamps_ns - log.stamps_ns[:1]) * 1e-9)
     finite = np.asarray(np.isfinite(positions).all(axis=1))
@@ -50,18 +53,22 @@ def doubts(log: RunLog) -> tuple[str, ...]:
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
     of_sensors = _of_imu(log) or _of_surprise(log, times)  # a wrong mounting surprises as well
-    return (*found, *_of_pauses(log, times), *_of_silence(log, times), *_of_clock(log), *of_sensors)
+    return (*found, *_of_pauses(log, times, tied_ns), *_of_silence(log, times), *_of_clock(log), *of_sensors)
 
 
-def _of_pauses(log: RunLog, times: F64) -> list[str]:
+def _of_pauses(log: RunLog, times: F64, tied_ns: I64) -> list[str]:
     """Whether there was neither a scan nor an IMU sample for a while, as when the recorder was paused."""
+    if not len(times):
+        return []
     waited, gap = np.diff(times, prepend=times[:1]), log.readout("imu_gap_s")
-    blank = (waited > BLANK_S) & ((gap > BLANK_S) | (gap == 0))  # 0: there was no sample at all
+    blank = (waited > PAUSE_S) & ((gap > PAUSE_S) | (gap == 0))  # 0: there was no sample at all
+    blank[np.searchsorted(log.stamps_ns, tied_ns[tied_ns <= log.stamps_ns[-1]])] = False
     if not blank.any():
         return []
     return [
         f"There are neither scans nor IMU samples for {waited[blank].max():.1f} s{_since(times - waited, blank)}; how "
-        "the device moved meanwhile is a guess, so the map may be metres off from then on."
+        "the device moved meanwhile is a guess, and no loop ties what follows to what was mapped before: both may lie "
+        "metres off each other."
     ]
 
 

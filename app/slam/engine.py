@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from app.slam import channels, coast, ground, iekf, imu, keyframes, rest, start
+from app.slam import channels, coast, ground, iekf, imu, keyframes, pause, rest, start
 from app.slam.certainty import Certainty
 from app.slam.clock import ClockOffset
 from app.slam.floor import Floor
@@ -18,6 +18,7 @@ from app.slam.keyframes import KeyframeStore
 from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
+from app.slam.pause import Interruption
 from app.slam.sections import FilterParams
 from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
 from app.slam.voxel import VoxelGrid, spread
@@ -32,6 +33,7 @@ class EngineProgress:
         T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
         floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
         lines: estimated errors of the scan lines. clock: estimated offset of the IMU's clock.
+        paused: the pause after which there is no keyframe yet; None: there is none.
     """
 
     frame: int = 0
@@ -43,6 +45,7 @@ class EngineProgress:
     floor: Floor | None = None
     lines: LineErrors = field(default_factory=LineErrors.unknown)
     clock: ClockOffset = field(default_factory=ClockOffset)
+    paused: Interruption | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +96,16 @@ class Engine:
             scan = channels.bent(scan, -lines.errors[:, 1], -lines.errors[:, 0])
         clock = before.clock if p.imu.learn_clock else ClockOffset()
         samples = clock.set_right(samples)
-        gap_s = imu.longest_gap(samples, end_ns)
-        gapless = gap_s <= p.imu.max_gap
+        silent_s = imu.longest_gap(samples, end_ns)
+        if before.belief is not None and (paused := pause.before(scan, samples, before.belief.state.stamp_ns)):
+            resumed, samples = pause.resumed(before.belief, paused, scan, samples, p)
+            before = replace(before, belief=resumed, floor=None, paused=paused)
+            self._map.clear()
+            notices.append(
+                f"There are neither scans nor IMU samples for {paused.seconds:.1f} s. The map begins anew; loops tie "
+                "it to what was mapped before."
+            )
+        gapless = imu.longest_gap(samples, end_ns) <= p.imu.max_gap
 
         belief, still, waiting = before.belief, before.still, False
         if belief is None and not len(samples):
@@ -107,10 +118,11 @@ class Engine:
         if len(samples):
             before_scan = belief if gapless else imu.before_gap(belief)
             predicted, path = imu.propagate(before_scan, samples, end_ns, p.imu, clock.sigma)
-            predicted = rest.hold(predicted, samples) if gapless else predicted
+            unsure = coast.is_unsure(predicted)
+            predicted = rest.hold(predicted, samples) if gapless and not unsure else predicted
             watch.lap("propagate")
             points = imu.deskew(scan, path, predicted.state)
-            course = coast.Course.measured(path, predicted.state) if not gapless or coast.is_unsure(predicted) else None
+            course = coast.Course.measured(path, predicted.state) if not gapless or unsure else None
         else:
             course = coast.Course.steady(belief.state.stamp_ns, end_ns)
             predicted = coast.propagate(belief, end_ns, course)
@@ -151,13 +163,19 @@ class Engine:
         status = FrameStatus.LOST if adrift else _status(waiting, self._map.voxels > 0, registration)
         watch.lap("update")
 
-        here, last = posterior.state.T_odom_imu, before.T_odom_keyframe
-        due = not waiting and keyframes.is_due(last, here, p.keyframe)
-        if due and last is not None and status is FrameStatus.TRACKING and p.filter.learn_lines:
-            walked = float(np.linalg.norm(here[:3, 3] - last[:3, 3]))
-            lines = lines.learnt(posterior, points, scan.ring, walked, self._map, p.filter)
         if registration.inliers and status is FrameStatus.TRACKING and len(samples) and gapless and p.imu.learn_clock:
             clock = clock.learnt(samples, predicted.state, posterior.state)
+        paused = before.paused
+        settling = paused is not None and not pause.is_over(paused, end_ns)
+        if paused is not None and not settling:
+            posterior = pause.levelled(posterior)
+            self._map.clear()
+        here, last = posterior.state.T_odom_imu, before.T_odom_keyframe
+        due = not waiting and not settling and (paused is not None or keyframes.is_due(last, here, p.keyframe))
+        mapped = status is FrameStatus.TRACKING and paused is None
+        if due and last is not None and mapped and p.filter.learn_lines:
+            walked = float(np.linalg.norm(here[:3, 3] - last[:3, 3]))
+            lines = lines.learnt(posterior, points, scan.ring, walked, self._map, p.filter)
         if not waiting:
             self._insert(posterior, sampled.points, float(np.nan_to_num(registration.residual_rms)))
         watch.lap("insert")
@@ -168,7 +186,7 @@ class Engine:
         keyframe, certainty = None, before.certainty
         if due:
             certainty = (certainty or Certainty.begin(posterior, refined=p.filter.estimate_extrinsics)).moved(posterior)
-            keyframe = self._keyframe(posterior, cloud, certainty)
+            keyframe = self._keyframe(posterior, cloud, certainty, 0 if paused is None else paused.end_ns)
         watch.lap("keyframe")
 
         if status is not before.status and FrameStatus.LOST in (status, before.status):
@@ -189,7 +207,7 @@ class Engine:
             keyframe=keyframe,
             notices=tuple(notices),
             truth_ground=scan.truth_ground,
-            imu_gap_s=gap_s,
+            imu_gap_s=silent_s,
             clock_late_s=clock.late,
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
@@ -203,6 +221,7 @@ class Engine:
             floor=surface.floor,
             lines=lines,
             clock=clock,
+            paused=paused if settling else None,
         )
         return result
 
@@ -252,7 +271,7 @@ class Engine:
         T = belief.state.T_odom_lidar.astype(np.float32)
         self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
 
-    def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty) -> Keyframe:
+    def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty, resumed_ns: int) -> Keyframe:
         state = belief.state
         covariance = certainty.in_map(belief)
         keyframe = Keyframe(
@@ -264,6 +283,7 @@ class Engine:
             covariance=covariance,
             cloud=cloud,
             drift=certainty.covariance(belief) - covariance,
+            resumed_ns=resumed_ns,
         )
         self.keyframes.append(keyframe)
         return keyframe

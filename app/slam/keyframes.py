@@ -25,6 +25,7 @@ _HEAD = np.dtype(
         ("T_imu_lidar", "<f8", (4, 4)),
         ("covariance", "<f8", (6, 6)),
         ("drift", "<f8", (6, 6)),
+        ("resumed_ns", "<i8"),
         ("points", "<i8"),
     ]
 )
@@ -101,13 +102,14 @@ class KeyframeStore:
             covariance=head["covariance"].copy(),
             cloud=Cloud(**columns),
             drift=head["drift"].copy(),
+            resumed_ns=int(head["resumed_ns"]),
         )
 
-    def when(self, index: int) -> tuple[int, int]:
-        """Frame and stamp (ns) of a keyframe, without reading its cloud."""
+    def when(self, index: int) -> tuple[int, int, int]:
+        """Frame, stamp and `resumed_ns` of a keyframe, without reading its cloud."""
         begin = self._ends[index - 1] if index else 0
         head = np.frombuffer(os.pread(self._file.fileno(), _HEAD.itemsize, begin), dtype=_HEAD)[0]
-        return int(head["frame"]), int(head["stamp_ns"])
+        return int(head["frame"]), int(head["stamp_ns"]), int(head["resumed_ns"])
 
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[i] for i in range(len(self)))
@@ -115,7 +117,7 @@ class KeyframeStore:
     def append(self, keyframe: Keyframe) -> None:
         cloud = keyframe.cloud
         head = np.zeros((), dtype=_HEAD)
-        for name in ("frame", "stamp_ns", "T_odom_imu", "T_imu_lidar", "covariance", "drift"):
+        for name in ("frame", "stamp_ns", "T_odom_imu", "T_imu_lidar", "covariance", "drift", "resumed_ns"):
             head[name] = getattr(keyframe, name)
         head["points"] = len(cloud)
         begin = self._ends[self._count - 1] if self._count else 0

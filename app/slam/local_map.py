@@ -73,6 +73,11 @@ class LocalMap:
     def voxels(self) -> int:
         return self._used
 
+    def clear(self) -> None:
+        """Forget all points."""
+        self._used = 0
+        self._evict(self._center, math.inf)
+
     def insert(self, points: F32, position: F64, params: MapParams, residual: float = 0.0) -> None:
         """Add (n, 3) odom points seen from `position` (3,), and drop voxels beyond the radius around it.
 

@@ -8,6 +8,8 @@ from app.slam import lie
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
 
+NO_PAUSES = np.empty(0, np.int64)
+
 
 @dataclass(frozen=True, slots=True)
 class MapFrame:
@@ -16,10 +18,12 @@ class MapFrame:
     Attributes:
         stamps_ns: (n,) of all keyframes.
         T_map_odom: (k, 4, 4) at the first k <= n of them. The last one holds at all later keyframes.
+        pauses_ns: (m,) when each pause of the recording ended; nothing is interpolated across one.
     """
 
     stamps_ns: I64 = field(default_factory=lambda: np.empty(0, np.int64))
     T_map_odom: F64 = field(default_factory=lambda: np.empty((0, 4, 4)))
+    pauses_ns: I64 = field(default_factory=lambda: NO_PAUSES)
 
     @classmethod
     def levelling(cls, g_map: F64) -> "MapFrame":
@@ -43,8 +47,10 @@ class MapFrame:
         if not len(self.T_map_odom):
             return frame
         count = max(len(self.T_map_odom), len(frame.T_map_odom))
-        stamps_ns = max(self.stamps_ns, frame.stamps_ns, key=len)
-        return MapFrame(stamps_ns, np.array([self.at(k) @ frame.at(k) for k in range(count)]))
+        stamps_ns, pauses_ns = (
+            max(pair, key=len) for pair in ((self.stamps_ns, frame.stamps_ns), (self.pauses_ns, frame.pauses_ns))
+        )
+        return MapFrame(stamps_ns, np.array([self.at(k) @ frame.at(k) for k in range(count)]), pauses_ns)
 
     def poses(self, T_odom_imu: F64) -> F64:
         """(k, 4, 4) T_map_imu of the first k keyframes from their (k, 4, 4) T_odom_imu."""
@@ -59,18 +65,22 @@ class MapFrame:
         if not len(self.T_map_odom) or not len(odometry):
             return odometry
         stamps_ns = self.stamps_ns[: len(self.T_map_odom)]
-        poses = corrected(odometry.stamps_ns, odometry.poses, stamps_ns, self.T_map_odom)
+        poses = corrected(odometry.stamps_ns, odometry.poses, stamps_ns, self.T_map_odom, self.pauses_ns)
         return Trajectory.from_poses(odometry.stamps_ns, poses)
 
 
-def corrected(stamps_ns: I64, T_odom_imu: F64, keyframe_stamps_ns: I64, corrections: F64) -> F64:
+def corrected(
+    stamps_ns: I64, T_odom_imu: F64, keyframe_stamps_ns: I64, corrections: F64, pauses_ns: I64 = NO_PAUSES
+) -> F64:
     """(n, 4, 4) T_map_imu of frames, their corrections interpolated by time between the keyframes' ones.
 
     Before the first keyframe its correction holds, after the last one that one's; with none, odometry stays.
+    Across a pause nothing is interpolated: on either side the nearest keyframe's correction holds.
 
     Args:
         stamps_ns: (n,) of the frames. T_odom_imu: (n, 4, 4).
         keyframe_stamps_ns: (k,) ascending. corrections: (k, 4, 4) T_map_odom at each keyframe.
+        pauses_ns: (m,) ascending, as in `MapFrame`.
     """
     if not len(keyframe_stamps_ns):
         return T_odom_imu.copy()
@@ -79,6 +89,8 @@ def corrected(stamps_ns: I64, T_odom_imu: F64, keyframe_stamps_ns: I64, correcti
     between = (keyframe_stamps_ns[after] - keyframe_stamps_ns[before]).astype(np.float64)
     passed = (stamps_ns - keyframe_stamps_ns[before]).astype(np.float64)
     share = np.clip(passed / np.where(between > 0, between, 1.0), 0.0, 1.0)
+    begun, ended = (np.searchsorted(pauses_ns, keyframe_stamps_ns[side]) for side in (before, after))
+    share = np.where(begun < ended, np.searchsorted(pauses_ns, stamps_ns, side="right") == ended, share)
     # interpolated between the corrected poses' differences from odometry AT the frame, so that a correction far from
     # the origin, a turn and a large shift that nearly cancel, does not swing in between
     here = T_odom_imu.copy()

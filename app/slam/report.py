@@ -9,27 +9,30 @@ import numpy as np
 from app import __version__
 from app.slam.doubts import doubts
 from app.slam.errors import HemislamError
+from app.slam.map_frame import NO_PAUSES
 from app.slam.metrics import compare
 from app.slam.provenance import describe_machine, peak_memory_mb
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory
-from app.slam.types import F64, TIMINGS, FrameStatus
+from app.slam.types import F64, I64, TIMINGS, FrameStatus
 
 MOST_NOTED = 5
 """Different notices that the summary lists; report.json has them all."""
 
 
-def make_report(log: RunLog, trajectory: Trajectory, info: RunInfo, sha256: str | None) -> dict[str, Any]:
+def make_report(
+    log: RunLog, trajectory: Trajectory, info: RunInfo, sha256: str | None, tied_ns: I64 = NO_PAUSES
+) -> dict[str, Any]:
     """What report.json holds of a trajectory; numbers that do not exist are NaN or None.
 
     Args:
-        sha256: of the recording, as `hash_input`.
+        sha256: of the recording, as `hash_input`. tied_ns: as in `doubts`.
     """
     score = log.ground_score
     return {
         "hemislam": __version__,
         "stopped_early": info.stopped or None,
-        "doubts": list(doubts(log)),
+        "doubts": list(doubts(log, tied_ns)),
         "calibration": info.calibration or None,
         "recording": {
             "path": str(info.recording),

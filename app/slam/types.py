@@ -278,6 +278,7 @@ class Keyframe:
         covariance: (6, 6) of the pose against the local map, rotation (IMU frame) then translation (odom).
         cloud: in the LiDAR frame at `stamp_ns`.
         drift: (6, 6) what adds to it since the first keyframe.
+        resumed_ns: when the scans went on, if it is the first after a pause (`app.slam.pause`); otherwise 0.
     """
 
     index: int
@@ -288,6 +289,7 @@ class Keyframe:
     covariance: F64
     cloud: Cloud
     drift: F64 = field(default_factory=lambda: np.zeros((6, 6)))
+    resumed_ns: int = 0
 
 
 class FrameStatus(StrEnum):

@@ -283,7 +283,7 @@ def test_a_comparison_on_the_way_back_waits_for_no_frame_that_is_forgotten() -> 
 
 
 def test_a_doubt_is_told_while_it_plays_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(player, "doubts", lambda log: (f"It moves at {len(log)} m/s.",) if len(log) > 150 else ())
+    monkeypatch.setattr(player, "doubts", lambda log, _: (f"It moves at {len(log)} m/s.",) if len(log) > 150 else ())
     bench = Bench("walk-250.mcap")
     bench.do(Seek(190))
     assert not [notice for notice in bench.see().notices if "doubtful" in notice.text]

@@ -73,6 +73,8 @@ def test_a_recorder_that_was_paused_is_reported_if_the_imu_does_not_tell_the_way
     assert doubts(whole) == ()
     assert len(found := doubts(paused)) == told
     assert all("neither scans nor IMU samples for 2.1 s, first at 4.9 s;" in doubt for doubt in found)
+    assert not doubts(paused, paused.stamps_ns[50:51] - 10_000_000), "a loop ties it"
+    assert doubts(paused, paused.stamps_ns[49:50] - 10_000_000) == found, "that is no loop across it"
 
 
 def test_a_walk_of_which_most_scans_were_dropped_is_reported() -> None:

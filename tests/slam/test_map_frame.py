@@ -40,6 +40,16 @@ def test_a_piece_of_a_trajectory_lies_where_it_does_in_the_whole() -> None:
     np.testing.assert_array_equal(frame.trajectory(piece).positions, frame.trajectory(ODOMETRY).positions[37:])
 
 
+def test_frames_on_either_side_of_a_pause_go_with_the_nearest_keyframe() -> None:
+    before, after = np.eye(4), lie.transform(np.eye(3), np.array([5.0, 0, 0]))
+    frame = MapFrame(ODOMETRY.stamps_ns[[10, 20, 30]], np.stack([before, after, after]), ODOMETRY.stamps_ns[[14]])
+    moved = (frame.trajectory(ODOMETRY).positions - ODOMETRY.positions)[:, 0]
+    np.testing.assert_allclose(moved[:14], 0.0, atol=1e-9)
+    np.testing.assert_allclose(moved[14:], 5.0, atol=1e-9)
+    again = frame.over(frame).trajectory(ODOMETRY).positions - ODOMETRY.positions
+    np.testing.assert_allclose(again[14:, 0], 10.0, atol=1e-9)
+
+
 def test_levelling_turns_gravity_down_and_keeps_the_heading() -> None:
     g_map = np.array([0.03, -0.05, -9.8])
     R = MapFrame.levelling(g_map).newest[:3, :3]

@@ -21,7 +21,7 @@ from app.slam.loops.submap import Submaps
 from app.slam.loops.types import LoopDetail
 from app.slam.loops.verification import Prepared
 from app.slam.sections import LoopsParams
-from app.slam.types import F64, I64, Cloud, Keyframe
+from app.slam.types import F64, I64, Cloud, Keyframe, Mask
 
 NEAR_M = 3.0
 """Added to the reach of drift: places this far apart still share a view."""
@@ -72,6 +72,7 @@ class Detector:
         self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
+        self._resumed = np.empty(0, np.bool_)
         self.stand(0, ())
 
     def __len__(self) -> int:
@@ -91,11 +92,22 @@ class Detector:
         """(k, 4, 4) T_odom_imu."""
         return self._poses[: len(self)]
 
+    @property
+    def resumed(self) -> Mask:
+        """(k,) which are the first after a pause."""
+        return self._resumed[: len(self)]
+
+    @property
+    def pieces(self) -> I64:
+        """(k,) number of pauses before each."""
+        return np.cumsum(self.resumed)
+
     def take(self, keyframe: Keyframe) -> None:
         """Store a new keyframe with its cloud; `go_on` and `stand` go to it."""
         self._heads.append(replace(keyframe, cloud=_NO_POINTS))
         self._poses = np.concatenate([self._poses, keyframe.T_odom_imu[None]])
         self._stamps = np.append(self._stamps, keyframe.stamp_ns)
+        self._resumed = np.append(self._resumed, keyframe.resumed_ns > 0)
         self._submaps.append(keyframe)
 
     def stand(self, count: int, contexts: Sequence[ScanContext]) -> None:
@@ -118,7 +130,7 @@ class Detector:
         if len(self._heads) == len(self):
             return
         del self._heads[len(self) :]
-        self._poses, self._stamps = self._poses[: len(self)], self._stamps[: len(self)]
+        self._poses, self._stamps, self._resumed = self.poses, self._stamps[: len(self)], self.resumed
         self._submaps.truncate(len(self))
         self._around.cache_clear()
         self._prepared.cache_clear()
@@ -130,21 +142,28 @@ class Detector:
 
     def describe(self, index: int) -> ScanContext:
         """The context of a keyframe, from the keyframes around it."""
-        return scan_context.describe(self._around(index, self._first(index), self.last(index)).points)
+        first, last = self._first(index, self.half), self.last(index, self.half)
+        return scan_context.describe(self._around(index, first, last).points)
 
     def context(self, index: int) -> ScanContext:
         return self._contexts[index] if index < self.described else self.describe(index)
 
     def submap(self, index: int) -> Prepared:
         """From the keyframes around one, up to the nearest slip of odometry on either side."""
-        before, after = range(index, self._first(index), -1), range(index + 1, self.last(index) + 1)
+        before = range(index, self._first(index, self.half), -1)
+        after = range(index + 1, self.last(index, self.half) + 1)
         first = next((k for k in before if self.slip(k) is not None), before.stop)
         end = next((k for k in after if self.slip(k) is not None), after.stop) - 1
         return self._prepared(index, first, end)
 
     def slip(self, index: int) -> F64 | None:
-        """How far odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`."""
-        first, last = max(0, index - slips.REACH), min(len(self), index + slips.REACH) - 1
+        """How far odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`.
+
+        Not across a pause, where it is a guess.
+        """
+        if self._resumed[index]:
+            return None
+        first, last = self._first(index, slips.REACH), self.last(index, slips.REACH - 1)
         if (index, last) not in self._slips:
             before, after = self._pieces(first, index - 1), self._pieces(index, last)
             self._slips[index, last] = slips.slip(before, after, self.guess(first, index, self._poses))
@@ -205,8 +224,10 @@ class Detector:
 
     def _eligible(self, newer: int, expectation: Expectation, params: LoopsParams) -> I64:
         """Keyframes old enough and within the reach of drift."""
-        stamps = self._stamps
-        old = np.flatnonzero(stamps[: self.described] <= stamps[newer] - round(params.min_time * 1e9))
+        stamps = self._stamps[: self.described]
+        old = stamps <= self._stamps[newer] - round(params.min_time * 1e9)
+        old[: self._begin(newer)] = True
+        old = np.flatnonzero(old)
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
         reach = WIDER * params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
         return np.asarray(old[away < reach])
@@ -222,13 +243,20 @@ class Detector:
         distance = float(np.where(allowed, distances, np.inf).min())
         return Sighting(KeyframeId(0, older), KeyframeId(0, newer), distance)
 
-    def last(self, index: int) -> int:
-        """The last keyframe of the submap about one."""
-        return min(len(self) - 1, index + self.half)
+    def last(self, index: int, ahead: int) -> int:
+        """The last of the next few keyframes that no pause separates from one."""
+        end = min(len(self), index + ahead + 1)
+        paused = np.flatnonzero(self._resumed[index + 1 : end])
+        return index + int(paused[0]) if len(paused) else end - 1
 
-    def _first(self, index: int) -> int:
-        """The first keyframe of the submap about one."""
-        return max(0, index - self.half)
+    def _first(self, index: int, back: int) -> int:
+        """The first of the few keyframes before one that no pause separates from it."""
+        return max(self._begin(index), index - back)
+
+    def _begin(self, index: int) -> int:
+        """The first keyframe after the last pause before one, or of all."""
+        paused = np.flatnonzero(self._resumed[: index + 1])
+        return int(paused[-1]) if len(paused) else 0
 
     def _piece(self, first: int, last: int) -> Prepared:
         return verification.prepare(self._submaps.around(first, self._poses, first, last))

@@ -18,10 +18,15 @@ from scipy.sparse.csgraph import dijkstra
 from app.slam import lie
 from app.slam.loops.types import LoopEdge
 from app.slam.sections import LoopsParams
-from app.slam.types import F64
+from app.slam.types import F64, Mask
 
 POSITION_M, ROTATION = 0.05, np.radians(0.5)
 """Standard deviations at distance zero, of registration and of submaps (m; rad about each axis)."""
+PAUSE_M, PAUSE_TURN = 100.0, np.radians(7.5)
+"""A pause counts as so many metres of odometry, and adds an error of the heading: a recording is expected to go on
+about where it stopped, and facing about the same way. Elsewhere, places that look alike could not be told apart."""
+PAUSE_TILT = np.radians(1.0)
+"""Error of roll and pitch by a pause: after so short a time in motion, the filter hardly knows gravity better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +65,15 @@ class Expectation:
         root: index. poses: (k, 4, 4) T_map_imu. way: (k,) m, shortest through the graph.
         lever: (k, 3) m^2, integral of the lever arm along the way: what a constant rate of heading
             drift, rad/m, is multiplied by (crossed with z) to give the error of position.
+        pauses: (k,) on the way. arm: (k, 3) m, sum of the ways from them to the root, as the crow flies.
     """
 
     root: int
     poses: F64
     way: F64
     lever: F64
+    pauses: F64
+    arm: F64
     drift: Drift
 
     def covariance(self, other: int) -> F64:
@@ -73,16 +81,22 @@ class Expectation:
         way = float(self.way[other])
         heading = self.drift.rotation * way
         sideways = self.drift.rotation * np.array([-self.lever[other, 1], self.lever[other, 0], 0.0])
+        turned = PAUSE_TURN * float(self.pauses[other])
+        swung = PAUSE_TURN * np.array([-self.arm[other, 1], self.arm[other, 0], 0.0])
         out = np.zeros((6, 6))
-        out[:3, :3] = np.diag([0.0, 0.0, heading**2]) + ROTATION**2 * np.eye(3)
+        tilted = PAUSE_TILT * float(self.pauses[other])
+        out[:3, :3] = np.diag([0.0, 0.0, heading**2 + turned**2]) + (ROTATION**2 + tilted**2) * np.eye(3)
         along = np.array([self.drift.translation, self.drift.translation, self.drift.height]) * way
-        out[3:, 3:] = np.diag(along**2) + POSITION_M**2 * np.eye(3) + np.outer(sideways, sideways)
+        out[3:, 3:] = (
+            np.diag(along**2) + POSITION_M**2 * np.eye(3) + np.outer(sideways, sideways) + np.outer(swung, swung)
+        )
         return out
 
     def position_sigmas(self) -> F64:
         """(k,) m, standard deviation of the root's position as seen from each, in its worst direction."""
         sideways = self.drift.rotation * np.hypot(self.lever[:, 0], self.lever[:, 1])
-        return np.asarray(np.sqrt((self.drift.translation * self.way) ** 2 + sideways**2 + POSITION_M**2))
+        swung = PAUSE_TURN * np.hypot(self.arm[:, 0], self.arm[:, 1])
+        return np.asarray(np.sqrt((self.drift.translation * self.way) ** 2 + sideways**2 + swung**2 + POSITION_M**2))
 
     def deviation(self, other: int, T_other_root: F64) -> Deviation:
         """Of a measured (4, 4) pose of the root, seen from `other`."""
@@ -96,11 +110,17 @@ class Expectation:
         return Deviation(sigmas, abs(float(error[5])) / float(np.sqrt(covariance[5, 5])), float(error[5]))
 
 
-def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Expectation:
-    """What the graph of poses (k, 4, 4) T_map_imu with these loops expects, seen from keyframe `root`."""
+def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift, resumed: Mask | None = None) -> Expectation:
+    """What the graph of poses (k, 4, 4) T_map_imu with these loops expects, seen from keyframe `root`.
+
+    Args:
+        resumed: (k,) which keyframes are the first after a pause; None: there was none.
+    """
     count, loops = len(poses), [loop for loop in loops if not loop.open]
     p = poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
+    resumed = np.zeros(count, np.bool_) if resumed is None else resumed
+    steps += PAUSE_M * resumed[1:]
     pairs = np.array([loop.pair for loop in loops], dtype=np.int64).reshape(-1, 2)
     measured = np.array([loop.T_older_newer for loop in loops]).reshape(-1, 4, 4)
     left = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]  # what the graph leaves of each loop
@@ -117,10 +137,14 @@ def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift) -> Ex
     before = np.where(before < 0, root, before)
     tied = before.copy()
     stretch = way - way[before]
-    moment = stretch[:, None] * (p + p[before]) / 2
+    each = np.arange(count)
+    across = (np.abs(each - before) == 1) & resumed[np.maximum(each, before)]
+    moment = np.column_stack(
+        [stretch[:, None] * (p + p[before]) / 2, across, across[:, None] * p[np.maximum(each, before)]]
+    )
     moment[root] = 0.0
     while (tied != root).any():
         moment = moment + moment[tied]
         tied = tied[tied]
-    lever = way[:, None] * p[root] - moment
-    return Expectation(root, poses, np.asarray(way), lever, drift)
+    lever, pauses = way[:, None] * p[root] - moment[:, :3], moment[:, 3]
+    return Expectation(root, poses, np.asarray(way), lever, pauses, pauses[:, None] * p[root] - moment[:, 4:], drift)

@@ -7,7 +7,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.drift import Drift
+from app.slam.loops.drift import PAUSE_TILT, Drift
 from app.slam.loops.support import transported
 from app.slam.loops.types import FactorResidual, LoopEdge, Pair
 from app.slam.types import F64, Keyframe
@@ -66,6 +66,8 @@ Step = Factor | tuple[Closing, ...]
 
 STILL_M, STILL_RAD = 0.001, np.radians(0.02)
 """Standard deviations of a step, however short."""
+LOST_M, LOST_RAD = 10.0, 1.0
+"""Standard deviations of a step across a pause, along each axis and of the heading."""
 EVEN_M = 1.0
 """m over which drift keeps its direction: over a distance L it grows to drift * sqrt(L * EVEN_M)."""
 
@@ -75,7 +77,7 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
 
     The filter gives the covariance of each pose in its map, which it takes as exact, not that of the step between them.
     So the covariances of both poses are added, as if they were independent (an upper bound), and drift is added as a
-    random walk: constant over `EVEN_M`, independent beyond.
+    random walk: constant over `EVEN_M`, independent beyond. A step across a pause is a guess.
     """
     T = lie.inverse(before.T_odom_imu) @ after.T_odom_imu
     walked = float(np.linalg.norm(T[:3, 3]))
@@ -87,6 +89,9 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
     covariance[:3, :3] += STILL_RAD**2 * np.eye(3) + drift.rotation**2 * even * np.outer(up, up)
     covariance[3:, 3:] += (STILL_M**2 + drift.translation**2 * even) * np.eye(3)
     covariance[3:, 3:] += (drift.height**2 - drift.translation**2) * even * np.outer(up, up)
+    if after.resumed_ns:
+        covariance[:3, :3] += PAUSE_TILT**2 * np.eye(3) + LOST_RAD**2 * np.outer(up, up)
+        covariance[3:, 3:] += LOST_M**2 * np.eye(3)
     return Factor(KeyframeId(0, second - 1), KeyframeId(0, second), T, (covariance + covariance.T) / 2)
 
 

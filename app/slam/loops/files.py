@@ -1,7 +1,9 @@
 """The result files about loops."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from app.slam.loops.types import LoopEdge, Verdict
@@ -32,8 +34,25 @@ class LoopResults:
     edges: tuple[LoopEdge, ...]
     g2o: str
 
+    @property
+    def tied_ns(self) -> I64:
+        """(m,) ends of the pauses that accepted loops span."""
+        return tied_pauses(self.edges, self.stamps_ns, self.frame.pauses_ns)
+
     def count(self, verdict: Verdict) -> int:
         return sum(edge.verdict is verdict for edge in self.edges)
+
+
+def tied_pauses(edges: Iterable[LoopEdge], stamps_ns: I64, pauses_ns: I64) -> I64:
+    """(m,) ends of the pauses that accepted loops span.
+
+    Args:
+        stamps_ns: (k,) of keyframes. pauses_ns: (p,) ends of all pauses.
+    """
+    pairs = np.array([edge.pair for edge in edges if edge.verdict is Verdict.ACCEPTED], np.int64).reshape(-1, 2)
+    older, newer = stamps_ns[pairs].T
+    spanned = (older < pauses_ns[:, None]) & (pauses_ns[:, None] <= newer)
+    return np.asarray(pauses_ns[spanned.any(axis=1)])
 
 
 def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:

@@ -14,11 +14,12 @@ from app.slam.types import I64, Keyframe
 
 @dataclass(frozen=True, slots=True)
 class KeyframeEntry:
-    """The frame of a keyframe, its stamp, and the parameters to look for loops with."""
+    """The frame of a keyframe, its stamp, the parameters to look for loops with, and its `resumed_ns`."""
 
     frame: int
     stamp_ns: int
     params: LoopsParams
+    resumed_ns: int = 0
 
 
 class KeyframeLog(Log[KeyframeEntry]):
@@ -50,10 +51,15 @@ class KeyframeLog(Log[KeyframeEntry]):
         """(count,) of the first ones."""
         return np.array([entry.stamp_ns for entry in self[:count]], np.int64)
 
+    def pauses_ns(self, count: int) -> I64:
+        """(m,) when each pause among the first ones ended."""
+        return np.array([entry.resumed_ns for entry in self[:count] if entry.resumed_ns], np.int64)
+
     def take_stored(self, params: LoopsParams) -> None:
         """Add what the store holds and this log does not: keyframes of an engine whose session this one continues."""
         for index in range(len(self), len(self.store)):
-            self.append(KeyframeEntry(*self.store.when(index), params))
+            frame, stamp_ns, resumed_ns = self.store.when(index)
+            self.append(KeyframeEntry(frame, stamp_ns, params, resumed_ns))
             self.stored = len(self)
 
 

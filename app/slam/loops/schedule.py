@@ -18,7 +18,7 @@ from app.slam.errors import HemislamError
 from app.slam.keyframes import KeyframeStore
 from app.slam.log import Cursor
 from app.slam.loops.edits import Edits, check
-from app.slam.loops.files import LoopResults
+from app.slam.loops.files import LoopResults, tied_pauses
 from app.slam.loops.keyframe_log import KeyframeEntry, KeyframeLog
 from app.slam.loops.messages import (
     Answer,
@@ -36,7 +36,7 @@ from app.slam.loops.messages import (
 from app.slam.loops.types import LoopEdge, Verdict, difference
 from app.slam.map_frame import MapFrame
 from app.slam.sections import LoopsParams
-from app.slam.types import Keyframe
+from app.slam.types import I64, Keyframe
 
 UserRequest = Question | Callable[[Edits], Edits]
 """What the user asks, or makes of the edits: `Edits.undo`, for example, which may raise HemislamError."""
@@ -139,7 +139,7 @@ class LoopSchedule:
         self._finished, self._params = False, params
         if not self._log.holds(keyframe):
             self._forget(keyframe.index)
-            self._log.append(KeyframeEntry(keyframe.frame, keyframe.stamp_ns, params))
+            self._log.append(KeyframeEntry(keyframe.frame, keyframe.stamp_ns, params, keyframe.resumed_ns))
         self._ask_next()
 
     def go_to(self, frame: int) -> None:
@@ -224,6 +224,12 @@ class LoopSchedule:
         """Notices for the user since the last call."""
         taken, self._notices = self._notices, []
         return taken
+
+    @property
+    def tied_ns(self) -> I64:
+        """(m,) ends of the pauses that accepted loops in effect span."""
+        edges, count = (self.state.edges, self.state.count) if self.state else ((), 0)
+        return tied_pauses(edges, self._log.stamps_ns(count), self.frame.pauses_ns)
 
     def take_alarms(self) -> list[str]:
         """Failures of the loop search itself since the last call, in sentences; a session file does not keep them."""
@@ -369,7 +375,8 @@ class LoopSchedule:
     def _lay(self, state: LoopState) -> MapFrame:
         if (state.corrections == np.eye(4)).all():
             return self.frame if not len(self.frame.T_map_odom) else MapFrame()
-        return MapFrame(self._log.stamps_ns(state.count), state.corrections)
+        count = state.count
+        return MapFrame(self._log.stamps_ns(count), state.corrections, self._log.pauses_ns(count))
 
 
 def _after(edits: Edits, request: UserRequest) -> Edits:

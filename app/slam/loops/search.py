@@ -186,12 +186,12 @@ class Search:
         updates: dict[Pair, LoopEdge] = {}
         for newer in keyframes:
             accepted = [edge for edge in known.values() if edge.verdict is Verdict.ACCEPTED]
-            expectation = expect(newer, poses, accepted, drift)
+            expectation = expect(newer, poses, accepted, drift, detector.resumed)
             fresh = {edge.pair: edge for edge in self._judged(newer, expectation, params) if edge.pair not in known}
             known, settled = known | fresh, list(fresh.values())
             if any(edge.verdict is Verdict.CANDIDATE for edge in settled):
-                settled = settle(fresh, known, detector.poses, drift, params, now)
-                settled = placed(settled, known.values(), detector.poses, poses, detector.half)
+                settled = settle(fresh, known, detector.poses, detector.pieces, drift, params, now)
+                settled = placed(settled, known.values(), detector.poses, poses, detector.pieces, detector.half)
             updates.update((edge.pair, edge) for edge in settled)
             known.update(updates)
         contexts = tuple(detector.context(index) for index in range(first, keyframes.stop))

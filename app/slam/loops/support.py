@@ -15,12 +15,14 @@ from app.slam.loops.drift import Drift
 from app.slam.loops.types import LOOP_HUBER, LoopEdge, Origin, Pair, Verdict
 from app.slam.metrics import walked_m
 from app.slam.sections import LoopsParams
-from app.slam.types import F64
+from app.slam.types import F64, I64
 
 NAMED = 5
 """Most loops that are named as contradicting a candidate."""
 NEIGHBOURHOOD_M = 15.0
 """Loops whose ends are farther apart than this along the trajectory, on either side, are not compared."""
+ELSEWHERE_M = 1e6
+"""What a pause counts as along the trajectory: odometry tells nothing across it."""
 SAME = 2 * LOOP_HUBER
 """Standard deviations up to which two nearby loops count as the same; there Huber's loss halves the pull."""
 AGREE = 3.0
@@ -35,6 +37,7 @@ def settle(
     fresh: Mapping[Pair, LoopEdge],
     edges: Mapping[Pair, LoopEdge],
     poses: F64,
+    pieces: I64,
     drift: Drift,
     params: LoopsParams,
     now: int,
@@ -44,12 +47,12 @@ def settle(
     Args:
         fresh: new candidates with a verdict on each alone. edges: all, including those, as they count with the
             user's edits. A candidate that the user decided on is left alone.
-        poses: (k, 4, 4) T_odom_imu. now: newest keyframe.
+        poses: (k, 4, 4) T_odom_imu. pieces: (k,) number of pauses before each. now: newest keyframe.
 
     Returns:
         All of `fresh`, and earlier candidates whose verdict changed, without the user's edits.
     """
-    walked = walked_m(poses[:, :3, 3])
+    walked = walked_m(poses[:, :3, 3]) + pieces * ELSEWHERE_M
 
     def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:
         return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))
@@ -108,7 +111,7 @@ def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
 
 
 def placed(
-    settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], T_odom_imu: F64, T_map_imu: F64, half: int
+    settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], T_odom_imu: F64, T_map_imu: F64, pieces: I64, half: int
 ) -> list[LoopEdge]:
     """The same candidates; accepted ones name the loop that represents them or that they repeat, if there is one.
 
@@ -119,13 +122,15 @@ def placed(
       two, is represented by that tie. Otherwise the graph would grow denser with every visit to a place.
 
     Args:
-        edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). half: of a submap, in keyframes.
+        edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). pieces: (k,) number of pauses before each keyframe;
+            only loops between the same pieces are compared. half: of a submap, in keyframes.
     """
     counting = {edge.pair: edge for edge in edges if edge.counts}
     out = []
     for edge in settled:
         if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
-            edge = _placed(edge, counting.values(), T_odom_imu, T_map_imu, half)
+            alike = [other for other in counting.values() if (pieces[[*other.pair]] == pieces[[*edge.pair]]).all()]
+            edge = _placed(edge, alike, T_odom_imu, T_map_imu, half)
             if edge.counts:
                 counting[edge.pair] = edge
         out.append(edge)

@@ -23,8 +23,9 @@ LOOSE_M = 10.0
 FLOOR_M, FLOOR_YAW, FLOOR_TILT = 0.04, np.radians(0.5), np.radians(1.5)
 """Least standard deviations of a registration, however many points it has. A mounting error tilts clouds differently at
 different headings, so odometry, which observes gravity, is better in roll and pitch."""
-NEAR_M = 5.0
-"""Places farther apart are not tied: an error of 1 degree in the mounting moves one by 0.1 m as seen from the other."""
+NEAR_M, FAR_M = 5.0, 10.0
+"""Places farther apart are not tied: an error of 1 degree in the mounting moves one by 0.1 m as seen from the other.
+Across a pause of the recording, that is better than no tie."""
 POINT_M, INDEPENDENT = 0.1, 0.05
 """Standard deviation of a point's distance to a plane, including systematic errors, and the share of points whose
 errors are independent of their neighbours'."""
@@ -66,7 +67,10 @@ def judge(
         mahalanobis=found.deviation.sigmas,
     )
     T = _imu(detector, older, newer, fit.T_target_source)
-    reason = _objection(found, evidence, params) or ("" if broken else _far_off(found.deviation, evidence, params))
+    paused = detector.pieces[older] < detector.pieces[newer]
+    reason = _objection(found, evidence, params, FAR_M if paused else NEAR_M) or (
+        "" if broken else _far_off(found.deviation, evidence, params)
+    )
     return edge(T, covariance(detector, newer, fit, found.open), evidence, reason)
 
 
@@ -104,7 +108,7 @@ def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
     elif edit.guess:
         fit = assess(*both, refine(*both, register(*both, rough(*both, guess)[0])))
     else:
-        fit = _place(older, newer, detector, expect(newer, poses, (), Drift.of(params)), params).fit
+        fit = _place(older, newer, detector, expect(newer, poses, (), Drift.of(params), detector.resumed), params).fit
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added manually: overlap {100 * fit.overlap:.0f} %, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if edit.register else T_older_newer
@@ -128,14 +132,16 @@ def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = Non
     return np.asarray((out + out.T) / 2)
 
 
-def _objection(place: Placement, e: Evidence, p: LoopsParams) -> str:
+def _objection(place: Placement, e: Evidence, p: LoopsParams, near_m: float) -> str:
     """The first limit that is not met, in words and numbers; "" if all are met."""
     fit = place.fit
     if len(fit.residuals) < 100:
         return f"only {len(fit.residuals)} points correspond (least 100)"
     apart = float(np.linalg.norm(fit.T_target_source[:3, 3]))
-    if apart > NEAR_M:
-        return f"the places are {apart:.1f} m apart (most {NEAR_M:g} m)"
+    if apart > near_m:
+        return f"the places are {apart:.1f} m apart (most {near_m:g} m)"
+    if place.open is not None and apart > NEAR_M:
+        return f"it slides, and the places are {apart:.1f} m apart (most {NEAR_M:g} m)"
     if e.overlap < p.min_overlap:
         return f"the submaps overlap by {100 * e.overlap:.0f} % (least {100 * p.min_overlap:.0f} %)"
     if e.residual_rms > p.max_residual:

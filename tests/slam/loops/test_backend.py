@@ -18,11 +18,11 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.edits import Add, Edits, Solve, rows
 from app.slam.loops.factors import PositionPrior
-from app.slam.loops.files import loops_csv
+from app.slam.loops.files import loops_csv, tied_pauses
 from app.slam.loops.types import Origin, Verdict
 from app.slam.metrics import umeyama
 from app.slam.sections import LoopsParams
-from app.slam.types import F64
+from app.slam.types import F64, Keyframe
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, same
 from tests.slam.loops.walks import drive, error, revisits, take
 
@@ -112,6 +112,42 @@ def test_where_odometry_was_seen_to_break_loops_outvote_it_however_far_off_it_is
     across = [edge for edge in accepted(backend) if edge.older < at - PARAMS.submap_keyframes]
     assert any(edge.evidence.mahalanobis > 4 * PARAMS.max_mahalanobis for edge in across)
     assert max(error(edge, walked.walk.truth)[0] for edge in across) < 0.1
+
+
+def paused(
+    keyframes: tuple[Keyframe, ...], at: int, turned_deg: float, moved: tuple[float, float, float]
+) -> list[Keyframe]:
+    """The same walk if keyframe `at` comes after a pause: from there on odometry is off by a turn and a shift."""
+    here = lie.transform(np.eye(3), keyframes[at].T_odom_imu[:3, 3])
+    leap = lie.transform(lie.exp(np.array([0.0, 0.0, np.radians(turned_deg)])), np.array(moved))
+    off = here @ leap @ lie.inverse(here)
+    return [
+        replace(k, T_odom_imu=off @ k.T_odom_imu, resumed_ns=k.stamp_ns * (k.index == at)) if k.index >= at else k
+        for k in keyframes
+    ]
+
+
+@pytest.mark.parametrize("moved", [(0.0, 0.0, 0.0), (3.0, -1.5, 0.2)])
+def test_loops_tie_the_parts_of_a_walk_that_was_paused(walked: Walked, moved: tuple[float, float, float]) -> None:
+    """Whether the walker came back to where the pause began or went on meanwhile."""
+    keyframes, at = walked.walk.drifted(0.003, 0.005), 60
+    backend = drive(tuple(paused(keyframes, at, 15.0, moved)), PARAMS)
+    across = [edge for edge in accepted(backend) if edge.older < at <= edge.newer]
+    assert len(across) > 5
+    assert max(error(edge, walked.walk.truth)[0] for edge in across) < 0.3
+    assert misplaced(backend.poses, walked.walk.truth) < 0.1
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes])
+    ends = np.array([stamps_ns[at], stamps_ns[-1] + 1])
+    assert tied_pauses(across, stamps_ns, ends).tolist() == [stamps_ns[at]]
+
+
+def test_after_a_pause_nothing_is_tied_to_a_place_that_looks_the_same() -> None:
+    walk = take("identical", 55.0)
+    at = 2 * len(walk.keyframes) // 3
+    backend = drive(tuple(paused(walk.drifted(0.01, 0.02), at, 10.0, (1.0, 0.5, 0.0))), PARAMS)
+    assert any(edge.older < at <= edge.newer and edge.evidence.overlap > 0.8 for edge in backend.edges)
+    errors = [error(edge, walk.truth)[0] for edge in accepted(backend)]
+    assert max(errors, default=0.0) < 0.5, "the next door is 4 m away, the next corridor 6 m"
 
 
 # --- history -------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.slam import lie
-from app.slam.loops.drift import POSITION_M, ROTATION, Drift, expect
+from app.slam.loops.drift import PAUSE_M, PAUSE_TILT, PAUSE_TURN, POSITION_M, ROTATION, Drift, expect
 from app.slam.loops.types import Evidence, LoopEdge, Verdict
 from app.slam.types import F64
 
@@ -46,6 +46,20 @@ def test_the_lever_arm_is_what_a_steady_turn_does_to_the_end_of_the_walk() -> No
     np.testing.assert_allclose(covariance, np.outer(moved, moved), rtol=0.01, atol=1e-12)
     heading = expectation.covariance(0)[2, 2] - ROTATION**2
     assert np.sqrt(heading) == pytest.approx(40 * rate, rel=0.01)
+
+
+def test_across_a_pause_the_heading_is_unknown_and_turns_all_that_follows() -> None:
+    """Against turning what was walked after the pause, half of the square, about where it happened."""
+    points = square()
+    resumed = np.arange(len(points)) == 40
+    expectation = expect(80, path(points), [], Drift(1e-9, 1e-9, 1e-9), resumed)
+    arm = points[80] - points[40]
+    moved = PAUSE_TURN * np.array([-arm[1], arm[0]])
+    near, far = expectation.covariance(60), expectation.covariance(0)
+    np.testing.assert_allclose(far[3:5, 3:5] - POSITION_M**2 * np.eye(2), np.outer(moved, moved), rtol=0.05, atol=1e-2)
+    assert np.sqrt(far[2, 2]) == pytest.approx(np.sqrt(PAUSE_TURN**2 + PAUSE_TILT**2 + ROTATION**2))
+    assert np.sqrt(near[2, 2]) == pytest.approx(ROTATION), "nothing happened since"
+    assert expectation.way[0] == pytest.approx(40 + PAUSE_M, abs=0.1)
 
 
 def test_a_loop_is_a_short_cut_and_one_that_is_not_met_a_longer_one() -> None:

@@ -32,6 +32,7 @@ def there_and_back() -> F64:
 
 
 POSES = there_and_back()
+PIECES = np.zeros(2 * len(POSES), np.int64)
 
 
 def loop(older: int, off: F64 | None = None) -> LoopEdge:
@@ -47,7 +48,7 @@ def come(loops: list[LoopEdge], poses: F64 = POSES, in_map: F64 | None = None) -
     """One after the other, by their older ends."""
     edges: dict[int, LoopEdge] = {}
     for edge in loops:
-        (edges[edge.older],) = placed([edge], edges.values(), poses, poses if in_map is None else in_map, HALF)
+        (edges[edge.older],) = placed([edge], edges.values(), poses, poses if in_map is None else in_map, PIECES, HALF)
     return edges
 
 
@@ -90,7 +91,7 @@ def test_to_another_time_at_a_place_a_loop_counts_if_it_is_news_or_the_last_is_l
     T = lie.inverse(third[older]) @ third[newer]
     T[1, 3] += off_m
     second = replace(first, older=older, newer=newer, T_older_newer=T)
-    (edge,) = placed([second], [first], third, third, HALF)
+    (edge,) = placed([second], [first], third, third, PIECES, HALF)
     assert edge.counts is not told and edge.represented_by == (first.pair if told else None)
 
 
@@ -183,7 +184,7 @@ def test_no_loop_is_laid_on_one_that_the_user_made() -> None:
     made = replace(loop(40), origin=Origin.USER, edited=True)
     elsewhere = POSES.copy()
     elsewhere[TURN:, 1, 3] = 0.5
-    (edge,) = placed([loop(34)], [made], POSES, elsewhere, HALF)
+    (edge,) = placed([loop(34)], [made], POSES, elsewhere, PIECES, HALF)
     assert edge.counts and edge.repeats is None
 
 
@@ -227,7 +228,9 @@ SLIPPED = Evidence(overlap=0.8, residual_rms=0.03, slide=0.01, mahalanobis=9.0, 
 def judged(loops: list[LoopEdge], evidence: Evidence = SLIPPED) -> dict[int, LoopEdge]:
     """By their older ends, once all are there; odometry walks as `POSES`."""
     found = {edge.pair: replace(edge, verdict=Verdict.CANDIDATE, evidence=evidence) for edge in loops}
-    settled = settle(found, found, POSES, Drift(0.01, 0.002, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
+    settled = settle(
+        found, found, POSES, PIECES[: len(POSES)], Drift(0.01, 0.002, np.radians(0.02)), LoopsParams(), 2 * TURN - 1
+    )
     return {edge.older: edge for edge in settled}
 
 
@@ -275,7 +278,9 @@ def test_an_ambiguous_loop_that_agrees_neither_supports_nor_contradicts() -> Non
     def verdicts(ambiguous: list[LoopEdge]) -> set[Verdict]:
         found = {edge.pair: replace(edge, verdict=Verdict.CANDIDATE, evidence=near) for edge in sure}
         known = found | {edge.pair: replace(edge, verdict=Verdict.REJECTED, evidence=unsure) for edge in ambiguous}
-        settled = settle(found, known, POSES, Drift(0.01, 0.002, np.radians(0.02)), LoopsParams(), 2 * TURN - 1)
+        settled = settle(
+            found, known, POSES, PIECES[: len(POSES)], Drift(0.01, 0.002, np.radians(0.02)), LoopsParams(), 2 * TURN - 1
+        )
         return {edge.verdict for edge in settled}
 
     assert verdicts([loop(older) for older in (37, 36, 35)]) == {Verdict.ACCEPTED}
@@ -298,5 +303,5 @@ def test_along_a_direction_that_both_leave_open_loops_need_not_agree() -> None:
 def test_a_loop_that_leaves_a_direction_open_stands_for_none_that_does_not() -> None:
     along = np.diag([FLOOR_YAW**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
     opened = replace(loop(40), covariance=along)
-    assert [edge.represented_by for edge in placed([loop(39)], [opened], POSES, POSES, HALF)] == [None]
-    assert [edge.represented_by for edge in placed([opened], [loop(39)], POSES, POSES, HALF)] == [loop(39).pair]
+    assert [edge.represented_by for edge in placed([loop(39)], [opened], POSES, POSES, PIECES, HALF)] == [None]
+    assert [edge.represented_by for edge in placed([opened], [loop(39)], POSES, POSES, PIECES, HALF)] == [loop(39).pair]

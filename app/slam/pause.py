@@ -1,0 +1,95 @@
+"""A pause of both sensors in the middle of a recording, as when the recorder was paused: the local map begins anew.
+
+How the device moved meanwhile is a guess. It goes on from the last pose, turned so that the accelerometer shows gravity
+upwards; loops then tie what it sees to what was mapped before. The acceleration of a walk hides gravity at first. Once
+the filter knows its direction, odom is levelled, the map begins once more, and keyframes go on.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.slam import coast, lie
+from app.slam.imu import BA, BG, DIM, EXT, GRAV, POS, ROT, VEL, Belief
+from app.slam.kernels import manifold
+from app.slam.params import Params
+from app.slam.types import ImuSamples, Scan
+
+PAUSE_S = 1.5
+"""Of neither scans nor IMU samples. After less, the motion is bridged to centimetres."""
+WALKING = 1.5
+"""m/s: standard deviation of the velocity when the recording goes on."""
+TILTED = 0.15
+"""rad: standard deviation of the direction of gravity as a walking person's accelerometer shows it in one scan."""
+SETTLED_S = 2.0
+"""Of a walk, four steps. Then the filter knows the direction of gravity to about a degree."""
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Interruption:
+    """Attributes:
+    seconds: without anything measured. begin_ns: when it began. end_ns: when the scans went on.
+    """
+
+    seconds: float
+    begin_ns: int
+    end_ns: int
+
+
+def before(scan: Scan, samples: ImuSamples, last_ns: int) -> Interruption | None:
+    """The pause between the end of the last scan and this one, if there is one."""
+    inside = (samples.stamps_ns > last_ns) & (samples.stamps_ns < scan.stamp_ns)
+    known = np.concatenate([[last_ns], samples.stamps_ns[inside], [scan.stamp_ns]])
+    blanks = np.diff(known)
+    longest = int(blanks.argmax())
+    seconds = float(blanks[longest]) * 1e-9
+    return Interruption(seconds, int(known[longest]), scan.stamp_ns) if seconds > PAUSE_S else None
+
+
+def is_over(pause: Interruption, now_ns: int) -> bool:
+    """Whether odom can be levelled, and keyframes go on."""
+    return now_ns - pause.end_ns > SETTLED_S * 1e9
+
+
+def resumed(
+    last: Belief, pause: Interruption, scan: Scan, samples: ImuSamples, params: Params
+) -> tuple[Belief, ImuSamples]:
+    """The belief at the scan's begin, and the samples to go on with: those after the pause.
+
+    What is known of the sensors is kept. If the IMU is still silent, its earlier samples are returned, and if there is
+    none, the rate of turn, which stands in for the gyroscope's bias (`coast`), is unknown again.
+    """
+    state, later = last.state, samples.stamps_ns > pause.begin_ns
+    sigma = np.zeros(DIM)
+    sigma[ROT] = sigma[POS] = 1e-4  # the map begins at this pose
+    sigma[VEL], sigma[GRAV] = WALKING, TILTED
+    if later.any():
+        samples = ImuSamples(samples.stamps_ns[later], samples.gyro[later], samples.accel[later])
+        up = samples.accel.mean(axis=0) - state.b_accel
+    else:
+        up = coast.begin(scan, params).state.R_odom_imu[2]
+    covariance = np.diag(sigma**2)
+    sensors = np.r_[BG, BA, EXT]
+    covariance[np.ix_(sensors, sensors)] = last.covariance[np.ix_(sensors, sensors)]
+    here = replace(
+        state,
+        stamp_ns=scan.stamp_ns,
+        R_odom_imu=lie.between(state.R_odom_imu @ up, UP) @ state.R_odom_imu,
+        v_odom_imu=np.zeros(3),
+        g_odom=-np.linalg.norm(state.g_odom) * UP,
+    )
+    belief = Belief(here, covariance)
+    return (belief if len(samples) else coast.without_imu(belief)), samples
+
+
+def levelled(belief: Belief) -> Belief:
+    """The same, with odom turned about the device's place so that gravity points straight down."""
+    state = belief.state
+    turn = lie.between(-state.g_odom, UP)
+    down = turn @ state.g_odom
+    change = np.eye(DIM)
+    change[POS, POS] = change[VEL, VEL] = turn
+    change[GRAV, GRAV] = manifold.tangent_basis(down).T @ turn @ manifold.tangent_basis(state.g_odom)
+    level = replace(state, R_odom_imu=turn @ state.R_odom_imu, v_odom_imu=turn @ state.v_odom_imu, g_odom=down)
+    return Belief(level, change @ belief.covariance @ change.T)
