@@ -67,8 +67,8 @@ def _of_pauses(log: RunLog, times: F64, tied_ns: I64) -> list[str]:
         return []
     return [
         f"There are neither scans nor IMU samples for {waited[blank].max():.1f} s{_since(times - waited, blank)}; how "
-        "the device moved meanwhile is a guess, and no loop ties what follows to what was mapped before: both may lie "
-        "metres off each other."
+        "the device moved meanwhile is a guess, and so far no loop ties what follows to what was mapped before: they "
+        "may lie metres apart."
     ]
 
 
