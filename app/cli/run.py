@@ -100,7 +100,7 @@ def run(
             with contextlib.suppress(OSError):
                 folder.rmdir()  # only if it is empty
             raise stop or HemislamError(_nothing_processed(session))
-        if calibrate and not advised and doubts(session.log, session.log.stamps_ns):  # whatever pauses there were
+        if calibrate and not advised and doubts(session.log, session.log.stamps_ns):  # a pause is no cause
             advised = look_for_mounting(recording, params)
         session.calibration = advised
         save(session, folder, stop, replace=force)

@@ -1,7 +1,7 @@
 """A pause of both sensors in the middle of a recording, as when the recorder was paused: the local map begins anew.
 
-How the device moved meanwhile is a guess. It goes on from the last pose, turned so that the accelerometer shows gravity
-upwards; loops then tie what it sees to what was mapped before. The acceleration of a walk hides gravity at first. Once
+How the device moved meanwhile is a guess. It goes on from the last pose, tilted as the accelerometer shows; loops then
+tie what it sees to what was mapped before. The acceleration of a walk hides gravity at first. Once
 the filter knows its direction, odom is levelled, the map begins once more, and keyframes go on.
 """
 
