@@ -22,8 +22,9 @@ from app.sensors.sequencer import STUCK_SAMPLES, Counts, Sequencer
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.pause import PAUSE_S
 from app.slam.sections import ImuParams
-from app.slam.types import I64, DroppedScan, Scan
+from app.slam.types import F64, I64, DroppedScan, Scan
 
 DAMAGE = "file"
 """Subject of what is wrong with the file itself."""
@@ -58,11 +59,12 @@ def examine(
         progress(1.0)
         scans, imu = census.times()
         counts = census.sequencer.counts
+        pauses = _pauses(scans, imu)
         known = ("clocks", DAMAGE) if damage else ("clocks",)
         of_imu = (
             _rate("IMU rate", imu[:, 1], 90.0),
             clock_finding(scans, imu, params.recording.imu_time_offset),
-            _imu_gaps(counts, params.imu.max_gap),
+            _imu_gaps(counts, params.imu.max_gap, len(pauses)),
             _imu_time(counts),
             _imu_values(counts, len(imu), params.imu),
         )
@@ -73,6 +75,7 @@ def examine(
             _rate("scan rate", scans[:, 1], 4.0),
             *(of_imu if recording.imu_topic else ()),
             *_scan_time(scans),
+            *_of_pauses(pauses),
             _pairing(counts.paired, census.reasons),
             _returns(census, len(scans)),
         )
@@ -152,9 +155,32 @@ def _rate(subject: str, stamps: I64, least: float) -> Finding:
     return Finding(subject, "fine" if rate >= least else "needs you", text)
 
 
-def _imu_gaps(counts: Counts, limit_s: float) -> Finding:
-    if not counts.imu_gaps:
-        return Finding("IMU gaps", "fine", f"none longer than {limit_s:g} s")
+def _pauses(scans: I64, imu: I64) -> F64:
+    """(m, 2) s, when each time without scans and IMU samples begins, from the first stamp on, and how long it lasts."""
+    stamps = np.sort(np.concatenate([scans[:, 1:].ravel(), imu[:, 1]]))
+    if not len(stamps):
+        return np.empty((0, 2))
+    times = (stamps - stamps[0]) * 1e-9
+    lasts = np.diff(times)
+    return np.asarray(np.column_stack([times[:-1], lasts])[lasts > PAUSE_S])
+
+
+def _of_pauses(pauses: F64) -> list[Finding]:
+    if not len(pauses):
+        return []
+    begin, longest = pauses[pauses[:, 1].argmax()]
+    text = (
+        f"{len(pauses)} without scans and IMU samples, the longest {longest:.1f} s, at {begin:.1f} s: the recorder was "
+        "paused or too slow. The map begins anew there, and only loops tie its parts: go on where you stopped, facing "
+        "the same way"
+    )
+    return [Finding("pauses", "needs you", text)]
+
+
+def _imu_gaps(counts: Counts, limit_s: float, pauses: int) -> Finding:
+    if counts.imu_gaps <= pauses:
+        beside = " beside the pauses of the recording" if pauses else ""
+        return Finding("IMU gaps", "fine", f"none longer than {limit_s:g} s{beside}")
     longest = counts.longest_imu_gap_s
     text = (
         f"{counts.imu_gaps} longer than {limit_s:g} s, the longest {longest:.3f} s; "

@@ -57,6 +57,15 @@ def test_outages_steps_back_and_missing_scans_are_counted(tmp_path: Path) -> Non
     assert "2 missing" in found["scan time"].text and "0.300 s" in found["scan time"].text
 
 
+def test_a_pause_of_the_recorder_is_told_once_and_is_no_fault_of_the_imu(tmp_path: Path) -> None:
+    kept = [
+        entry for entry in rig.walk(turns=40, columns=4) if not 1_000_000_000 < entry[1] - rig.START_NS < 3_000_000_000
+    ]
+    found = by_subject(rig.write(tmp_path / "walk", kept))
+    assert found["pauses"].verdict == "needs you" and "1 without scans and IMU samples" in found["pauses"].text
+    assert "at 1.0 s" in found["pauses"].text and found["IMU gaps"].verdict == "fine"
+
+
 def test_zeros_in_place_of_imu_samples_are_named_and_are_a_gap(tmp_path: Path) -> None:
     entries = [
         (topic, log, rig.imu(log, accel=(0.0, 0.0, 0.0)) if topic == "/imu" and 5 < n / 20 < 10 else sent)
