@@ -1,6 +1,7 @@
 """The report of a run: report.json, and a summary of a few lines."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64, TIMINGS, FrameStatus
 
 MOST_NOTED = 5
-"""Different notices that the summary lists; report.json has them all."""
+"""Kinds of notices that the summary lists; report.json has all notices."""
 
 
 def make_report(
@@ -134,6 +135,16 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
             lines.append(("", f"without loops ATE {before['ate_m']['rmse']:.4f} m"))
     if report["calibration"]:
         lines.append(("calibrated", report["calibration"]))
-    lines += [("noted", f"{count} x {notice}") for notice, count in [*report["notices"].items()][:MOST_NOTED]]
+    lines += [("noted", text) for text in _noted(report["notices"])[:MOST_NOTED]]
     lines += [("memory", f"{report['peak_memory_mb']:.0f} MB at most"), ("saved in", str(folder))]
     return "\n".join(f"{name:<10} {text}" for name, text in (*warning, *lines, *warning))
+
+
+def _noted(notices: dict[str, int]) -> list[str]:
+    """Notices with their counts, the most frequent first. Those that differ in numbers alone are one: the first."""
+    alike: dict[str, list[str]] = {}
+    for notice in notices:
+        alike.setdefault(re.sub(r"\d+", "", notice), []).append(notice)
+    counted = [(sum(notices[one] for one in same), same) for same in alike.values()]
+    counted.sort(key=lambda entry: -entry[0])
+    return [f"{count} x {same[0]}{' and similar' if len(same) > 1 else ''}" for count, same in counted]

@@ -344,3 +344,15 @@ def test_a_file_that_is_no_map_is_refused(tmp_path: Path) -> None:
     (tmp_path / "map.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n")
     with pytest.raises(HemislamError, match="not a map of this version"):
         MapFile(tmp_path / "map.ply")
+
+
+def test_the_summary_lists_notices_that_differ_in_numbers_alone_as_one(tmp_path: Path, recording: Path) -> None:
+    told = ["no IMU sample for 0.31 s", "Lost.", "no IMU sample for 12.000 s"]
+    frames = [Frame.of(replace(frame(k), notices=(text,))) for k, text in enumerate(told)]
+    report = save_results(tmp_path / "out", Results(RunLog(frames), [], RunInfo(recording, Params())))
+    assert set(report["notices"]) == set(told)
+    noted = [line for line in summarise(report, tmp_path).splitlines() if line.startswith("noted")]
+    assert [line.split(maxsplit=1)[1] for line in noted] == [
+        "2 x no IMU sample for 0.31 s and similar",
+        "1 x Lost.",
+    ]
