@@ -148,6 +148,8 @@ def is_imu_to_blame(registration: Registration) -> bool:
 def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
     """Normal equations without the directions in which normals' errors explain more than all that the points tell."""
     eigenvalues, axes = np.linalg.eigh(H)
+    if eigenvalues[0] > 0.0:
+        return H, b
     told = axes[:, eigenvalues > 0.0]
     kept = told @ told.T
     return kept @ H @ kept, kept @ b

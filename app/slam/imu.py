@@ -123,7 +123,10 @@ def _unsteady(times: F64, rates: F64, forces: F64, clock_sigma: float, turn_erro
 
 def longest_gap(imu: ImuSamples, end_ns: int) -> float:
     """s, the longest time without a sample, up to `end_ns`; 0 without any samples."""
-    return float(np.diff(np.append(imu.stamps_ns, end_ns)).max(initial=0)) * 1e-9 if len(imu) else 0.0
+    if not len(imu):
+        return 0.0
+    longest = max(int(np.diff(imu.stamps_ns).max(initial=0)), end_ns - int(imu.stamps_ns[-1]))
+    return longest * 1e-9
 
 
 def before_gap(belief: Belief) -> Belief:

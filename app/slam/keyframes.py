@@ -13,7 +13,6 @@ from typing import IO
 
 import numpy as np
 
-from app.slam import lie
 from app.slam.sections import KeyframeParams
 from app.slam.types import F64, Cloud, Keyframe
 
@@ -44,9 +43,9 @@ def is_due(T_odom_last: F64 | None, T_odom_imu: F64, params: KeyframeParams) -> 
     """Whether the pose is far or turned enough from the last keyframe's, if there is one."""
     if T_odom_last is None:
         return True
-    delta = lie.inverse(T_odom_last) @ T_odom_imu
-    far = np.linalg.norm(delta[:3, 3]) > params.distance
-    turned = np.degrees(np.linalg.norm(lie.log(delta[:3, :3]))) > params.angle
+    far = np.linalg.norm(T_odom_imu[:3, 3] - T_odom_last[:3, 3]) > params.distance
+    cosine = (np.sum(T_odom_last[:3, :3] * T_odom_imu[:3, :3]) - 1.0) / 2.0  # of the angle, by the trace
+    turned = cosine < np.cos(np.radians(params.angle))
     return bool(far or turned)
 
 
