@@ -281,11 +281,15 @@ class Sequencer:
                 return "it repeats the scan before it (same time)"
             if begin_ns < self._last_stamp_ns or end_ns <= self._last_end_ns:
                 return "its time steps back before the scan before it"
+            if self._last_end_ns - begin_ns > end_ns - self._last_end_ns:
+                return "most of it is from the time of the scan before it"
         if self.without_imu:
             return ""
         if not self._stamps:
             return "there is no IMU sample"
-        if begin_ns < self._stamps[0]:
+        # samples from before the last scan's end are gone by now; the poses there are extrapolated
+        continued = self._last_end_ns is not None and self._stamps[0] <= self._last_end_ns
+        if begin_ns < self._stamps[0] and not continued:
             return "the IMU starts after it"
         if end_ns > self._stamps[-1]:
             if self._last_end_ns is None:

@@ -1,7 +1,7 @@
 """A scan is given with the IMU samples that cover it, as far as there are any; nothing good is lost."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -115,7 +115,7 @@ def test_every_measurement_is_in_order_and_covered_up_to_the_last_sample(imu: li
             continue
         times = entry.imu.stamps_ns
         assert (np.diff(times) > 0).all()
-        assert times[0] <= entry.scan.stamp_ns
+        assert times[0] <= max(entry.scan.stamp_ns, previous_end or 0)
         assert times[-1] >= entry.scan.end_ns or times[-1] == sequencer.newest_imu_ns
         assert (times[:-1] < entry.scan.end_ns).all()
         if previous_end is not None:
@@ -132,6 +132,20 @@ def test_scans_before_a_late_imu_are_dropped_and_the_rest_is_kept() -> None:
         (200, "the IMU starts after it"),
     ]
     assert stamps(out[3]) == samples(250, 400)
+
+
+@pytest.mark.parametrize("overlap_us", [1, 3_000, 30_000])
+def test_scans_that_overlap_the_one_before_are_used(overlap_us: int) -> None:
+    """By a rounded stamp, or as clouds of two LiDARs together do; a sample falls on the end of each scan."""
+    scans = [replace(scan(100 * n), stamp_ns=100 * n * MS - (n > 0) * overlap_us * 1000) for n in range(5)]
+    out, _ = feed(samples(-10, 520), scans)
+    assert not dropped(out)
+    assert [stamps(entry)[-1] >= 100 * n for n, entry in enumerate(out)] == [True] * 5
+
+
+def test_a_scan_sent_again_with_a_slightly_later_stamp_is_dropped() -> None:
+    out, _ = feed(samples(-10, 320), [scan(0), scan(100), replace(scan(100), stamp_ns=100 * MS + 1000), scan(200)])
+    assert dropped(out) == [(100, "most of it is from the time of the scan before it")]
 
 
 def told(entries: Sequence[Measurement | DroppedScan]) -> dict[int, tuple[str, ...]]:
