@@ -122,6 +122,7 @@ class Framing:
         self._points, self._at_once = NOTHING, False
         self._fitted: dict[tuple[object, ...], Stand] = {}
         self._stands: dict[int, Stand] = {}  # of browsers, as last shown
+        self._left: set[int] = set()  # browsers whose cameras were sent elsewhere
         server.initial_camera.fov = FOV
         self._begin(np.zeros(3))
 
@@ -144,7 +145,7 @@ class Framing:
         for number, client in clients.items():
             wanted = self._whole(client)
             shown = self._stands.get(number)
-            if shown is not wanted and self._untouched(client):
+            if shown is not wanted and number not in self._left and self._untouched(client):
                 there = wanted if shown is None or at_once else shown.towards(wanted, _EASE)
                 self._place(client, there, offset)
                 moving = True
@@ -155,7 +156,12 @@ class Framing:
         """Let a browser look at the whole map from one side, and keep doing so."""
         if way != FIT:
             self._ways[client.client_id] = way
+        self._left.discard(client.client_id)
         self._place(client, self._whole(client), offset)
+
+    def leave(self, client: viser.ClientHandle) -> None:
+        """Leave a browser's camera alone: it is sent elsewhere, but a slow browser may still say where it was put."""
+        self._left.add(client.client_id)
 
     def follow(self) -> None:
         """Let every browser look at the sensor, which is kept at the scene's origin."""
@@ -217,7 +223,7 @@ class CameraPanel:
     """Buttons that move the camera of the browser they are clicked in.
 
     Args:
-        framing: keeps the whole map in the picture. look_freely: stops following the sensor.
+        framing: keeps the whole map in the picture. look_freely: lets the camera be sent elsewhere, and stay there.
     """
 
     def __init__(self, page: Page, framing: Framing, look_freely: Callable[[viser.ClientHandle], None]) -> None:

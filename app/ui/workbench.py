@@ -113,9 +113,7 @@ class Workbench:
             with gui.add_folder("Pause when", expand_by_default=False):
                 self._breakpoints = BreakpointPanel(page)
         with tabs.add_tab("Loops", viser.Icon.INFINITY):
-            self._loops = LoopsPanel(
-                page, lambda client: self._appearance.look_freely(client), taken=lambda click: self._picks(click)
-            )
+            self._loops = LoopsPanel(page, self._look_freely, taken=lambda click: self._picks(click))
         with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
             self._study = StudyPanel(
                 page,
@@ -129,7 +127,7 @@ class Workbench:
             self._tune = TunePanel(page, forks, self._sides, results / "tuning")
         with tabs.add_tab("View", viser.Icon.EYE):
             self._appearance = AppearancePanel(gui, legend, Looks(server))
-            self._camera = CameraPanel(page, self._scene.framing, self._appearance.look_freely)
+            self._camera = CameraPanel(page, self._scene.framing, self._look_freely)
             with gui.add_folder("Pictures", expand_by_default=False):
                 self._pictures = PicturesPanel(
                     page, results, lambda: (self._appearance.key, self._appearance.view.light)
@@ -214,6 +212,11 @@ class Workbench:
 
     def _picks(self, click: viser.SceneClickEvent) -> bool:
         return self._measure.picking or self._notes.pin_at(click) is not None
+
+    def _look_freely(self, client: viser.ClientHandle) -> None:
+        """A browser's camera is sent somewhere else and is to stay there."""
+        self._appearance.look_freely(client)
+        self._scene.framing.leave(client)
 
     def _opened(self, tab: str) -> None:
         """Another tab, or "" for Escape, ends what was looked at under the one before. View changes only looks."""

@@ -87,12 +87,20 @@ class Bench:
         self.eventually(pressed)
 
     def look(self, position: Any, look_at: Any) -> None:
-        """Put the page's camera somewhere, and wait until it is there."""
+        """Put the page's camera somewhere, and wait until it is there.
+
+        Again if need be: a page that is still busy says late where it was before, and is put there again.
+        """
         self.eventually(lambda: bool(self.server.get_clients()))
         (client,) = self.server.get_clients().values()
         self.resting_camera(client)
-        client.camera.position, client.camera.look_at = position, look_at
-        self.resting_camera(client)
+
+        def there() -> bool:
+            client.camera.position, client.camera.look_at = position, look_at
+            self.page.wait_for_timeout(1000)
+            return bool(np.allclose(self.resting_camera(client), position, atol=1e-3))
+
+        self.eventually(there)
 
     def resting_camera(self, client: viser.ClientHandle) -> np.ndarray:
         """(3,) where the page's camera is, once it has said so and stays there."""

@@ -194,6 +194,17 @@ def test_who_moves_the_camera_keeps_it_until_he_asks_for_the_whole_map(framed: F
     assert browser.camera.position == pytest.approx(whole(2 * HALL, TOP, WIDE).position)
 
 
+def test_a_camera_that_is_sent_elsewhere_stays_there_though_its_browser_is_slow(framed: Framed) -> None:
+    framing, browser, _ = framed
+    put = browser.camera.position
+    framing.leave(browser)  # type: ignore[arg-type]
+    browser.camera.position = put  # what the browser says before it knows of the new place
+    framing.see(HALL, at_once=False)
+    assert framing.draw(np.zeros(3)) and browser.camera.position is put
+    framing.show(browser, FIT, np.zeros(3))  # type: ignore[arg-type]
+    assert browser.camera.position == pytest.approx(whole(HALL, OBLIQUE, WIDE).position)
+
+
 def test_following_looks_at_the_sensor_from_nearby(framed: Framed) -> None:
     framing, browser, _ = framed
     framing.show(browser, TOP, np.zeros(3))  # type: ignore[arg-type]
