@@ -116,13 +116,17 @@ class Publisher:
     @property
     def filled(self) -> bool:
         """Whether there is anything to take."""
-        behind = self._again or self._frames.cursor != self._cursor or self._chunks < self._chunks_ready
+        again = any(map(self._readable, self._again))
+        behind = again or self._frames.cursor != self._cursor or self._chunks < self._chunks_ready
         return bool(self._replaced or self._notices or behind)
 
     @property
     def _chunks_ready(self) -> int:
         """Keyframes whose cloud can be read: after a seek back, only those up to the session's frame."""
         return min(len(self._keyframes), len(self._clouds))
+
+    def _readable(self, keyframe: int) -> bool:
+        return keyframe < len(self._clouds)
 
     def take(self) -> Delta:
         """All changes since the last call."""
@@ -136,10 +140,11 @@ class Publisher:
         self._keyframes[kept:] = [keep + index for index, frame in enumerate(frames) if frame.keyframe]
         self._chunks = first = min(self._chunks, kept)
         self._chunks = max(first, min(self._chunks_ready, first + CHUNKS_AT_ONCE))
-        again = sorted(index for index in self._again if index < first)
+        shown = {index for index in self._again if index < first}
+        again = sorted(filter(self._readable, shown))  # the others once the session is there again
         chunks = tuple(thinned(self._clouds[index]) for index in (*again, *range(first, self._chunks)))
         delta = Delta(self._replaced, edges, keep, frames, chunks, tuple(self._notices))
-        self._replaced, self._notices, self._again, self.urgent = {}, [], set(), False
+        self._replaced, self._notices, self._again, self.urgent = {}, [], shown.difference(again), False
         return delta
 
     # --- events ----------------------------------------------------------------------------------

@@ -145,6 +145,20 @@ def test_labels_that_are_changed_over_and_over_make_the_map_no_coarser() -> None
         )
 
 
+def test_labels_changed_behind_where_the_session_was_taken_back_to_are_shown_when_it_is_there_again() -> None:
+    session = Session(10**9)
+    for _ in range(3):
+        session.add()
+    session.show(3)
+    ahead = session.keyframes[1:]
+    del session.keyframes[1:]  # their clouds cannot be read now; their frames stay known
+    session.page.show_again(2)
+    assert len(session.show(1)) == 1 and not session.page.filled
+    cloud = ahead[1].cloud
+    session.keyframes += [ahead[0], replace(ahead[1], cloud=replace(cloud, labels=np.ones_like(cloud.labels)))]
+    assert (session.show(3)[2].labels == 1).all()
+
+
 def test_a_reader_far_behind_gets_some_clouds_at_a_time() -> None:
     session = Session(10**9)
     for _ in range(3 * CHUNKS_AT_ONCE):
