@@ -27,6 +27,8 @@ to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a 
 20 ms leave 0.07 to 0.4."""
 OFTEN = 3
 """Of frames in which the sensors contradict each other, or in which none shows the motion, so many are doubtful."""
+UNCERTAIN = 0.2
+"""m: standard deviation of the position by the filter. Where scans show the motion it stays below 0.03."""
 LATE_S = 0.01
 """How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
 
@@ -53,7 +55,14 @@ def doubts(log: RunLog, tied_ns: I64 = NO_PAUSES) -> tuple[str, ...]:
         reason, _ = log.dropped.most_common(1)[0]
         found.append(f"{dropped} of {total + dropped} scans were dropped, mostly because {reason}.")
     of_sensors = _of_imu(log) or _of_surprise(log, times)  # a wrong mounting surprises as well
-    return (*found, *_of_pauses(log, times, tied_ns), *_of_silence(log, times), *_of_clock(log), *of_sensors)
+    return (
+        *found,
+        *_of_pauses(log, times, tied_ns),
+        *_of_silence(log, times),
+        *_of_openness(log, times),
+        *_of_clock(log),
+        *of_sensors,
+    )
 
 
 def _of_pauses(log: RunLog, times: F64, tied_ns: I64) -> list[str]:
@@ -81,6 +90,19 @@ def _of_silence(log: RunLog, times: F64) -> list[str]:
     return [
         f"In {np.count_nonzero(blind)} frames the IMU is silent and the scans leave the motion open"
         f"{_since(times, blind)}; the map may be metres off from then on."
+    ]
+
+
+def _of_openness(log: RunLog, times: F64) -> list[str]:
+    """Whether the scans leave one direction open for so long that the IMU cannot tell the position along it."""
+    sigma = log.readout("position_sigma")
+    uncertain = (sigma > UNCERTAIN) & ~(log.readout("imu_gap_s") > LONG_GAP)
+    if np.count_nonzero(uncertain) < OFTEN:
+        return []
+    return [
+        f"In {np.count_nonzero(uncertain)} frames the scans leave one direction open{_since(times, uncertain)}; the "
+        f"position along it is uncertain by up to {sigma[uncertain].max():.1f} m (one standard deviation). If the map "
+        "is off from then on, add a loop by hand."
     ]
 
 

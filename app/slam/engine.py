@@ -12,7 +12,7 @@ from app.slam import channels, coast, ground, iekf, imu, keyframes, pause, rest,
 from app.slam.certainty import Certainty
 from app.slam.clock import ClockOffset
 from app.slam.floor import Floor
-from app.slam.imu import Belief
+from app.slam.imu import POS, Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
 from app.slam.lines import LineErrors
@@ -209,6 +209,7 @@ class Engine:
             truth_ground=scan.truth_ground,
             imu_gap_s=silent_s,
             clock_late_s=clock.late,
+            position_sigma=float(np.sqrt(np.linalg.eigvalsh(posterior.covariance[POS, POS])[-1])),
         )
         T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
         self._progress = EngineProgress(

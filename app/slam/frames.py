@@ -14,12 +14,13 @@ READOUTS = (
     "propagate_ms", "deskew_ms", "ground_ms", "downsample_ms", "update_ms", "insert_ms", "keyframe_ms", "loops_ms",
     "total_ms",
     "iterations", "used", "inliers", "residual_rms", "degeneracy", "predicted_change", "correction",
-    "surprise", "imu_gap_s", "dropped", "clock_late_s", "speed", "gyro_bias", "accel_bias",
+    "surprise", "imu_gap_s", "dropped", "clock_late_s", "position_sigma", "speed", "gyro_bias", "accel_bias",
     "turn_x", "turn_y", "turn_z",
 )  # fmt: skip
 """Numbers of one frame, nan where there is none. `used` points were looked up in the map. `degeneracy` is the smallest
 eigenvalue of the pose information. `predicted_change` and `correction`, of the velocity by the IMU and by the update,
-are in m/s. `surprise` is as in `Registration`; `imu_gap_s`, `dropped` and `clock_late_s` are as in `StepResult`.
+are in m/s. `surprise` is as in `Registration`; `imu_gap_s`, `dropped`, `clock_late_s` and `position_sigma` are as in
+`StepResult`.
 `speed` is in m/s. The biases are norms. `turn_*` is the rotation vector (rad) of R_odom_imu."""
 
 FRAME = np.dtype(
@@ -101,6 +102,7 @@ def _readouts(result: StepResult) -> F64:
         "imu_gap_s": result.imu_gap_s,
         "dropped": result.dropped,
         "clock_late_s": result.clock_late_s,
+        "position_sigma": result.position_sigma,
         "speed": np.linalg.norm(state.v_odom_imu),
         "gyro_bias": np.linalg.norm(state.b_gyro),
         "accel_bias": np.linalg.norm(state.b_accel),

@@ -322,6 +322,7 @@ class StepResult:
         imu_gap_s: longest time between the IMU samples that cover it.
         dropped: scans dropped between the frame before and this one.
         clock_late_s: how late the IMU's clock is, as estimated so far.
+        position_sigma: m, standard deviation of the position in its most uncertain direction, by the filter.
     """
 
     index: int
@@ -343,6 +344,7 @@ class StepResult:
     imu_gap_s: float = 0.0
     dropped: int = 0
     clock_late_s: float = 0.0
+    position_sigma: float = 0.0
 
     @property
     def T_map_imu(self) -> F64:

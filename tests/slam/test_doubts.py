@@ -110,3 +110,10 @@ def test_scans_that_contradict_the_predicted_motion_in_a_few_frames_are_reported
 def test_a_clock_that_is_far_off_is_reported_though_it_was_corrected(late: float, told: str) -> None:
     found = doubts(log(WALK, clock_late_s=late))
     assert len(found) == bool(told) and all(told in doubt and "hemislam calibrate" in doubt for doubt in found)
+
+
+def test_a_position_that_the_filter_itself_does_not_know_is_reported() -> None:
+    sure, unsure = (log(WALK, position_sigma=value, imu_gap_s=0.005).frames for value in (0.03, 0.44))
+    assert doubts(RunLog([*sure[:50], *unsure[50:52], *sure[52:]])) == ()
+    (doubt,) = doubts(RunLog([*sure[:50], *unsure[50:59], *sure[59:]]))
+    assert "In 9 frames the scans leave one direction open, first at 5.0 s" in doubt and "up to 0.4 m" in doubt

@@ -220,3 +220,12 @@ def test_samples_that_break_the_numbers_cost_no_more_than_their_frames(sensor: s
         assert np.isfinite(result.state.T_odom_imu).all() and np.isfinite(result.state.v_odom_imu).all()
     metres, _ = worst(results, Walk(), since=45)
     assert metres < 0.1 or results[-1].status is FrameStatus.LOST
+
+
+@pytest.mark.parametrize(("end_m", "known"), [(5.0, True), (200.0, False)])
+def test_the_position_is_known_only_where_scans_show_the_motion(end_m: float, known: bool) -> None:
+    """A bare corridor, whose ends are seen or far beyond the scanner's reach."""
+    corridor = Scene(box(-end_m, -1.0, -1.3, end_m, 1.0, 1.4))
+    results = run(Engine(params_for(REAL)), measurements(corridor, Walk(), REAL, FRAMES))
+    sigma = np.array([r.position_sigma for r in results if r.status is FrameStatus.TRACKING])
+    assert (sigma[-10:] < 0.03).all() if known else (sigma[-10:] > 0.1).all()
