@@ -1,7 +1,7 @@
-"""Reads an MCAP from front to back, for files that rosbags refuses: cut off, or without a ROS 2 profile."""
+"""Reads MCAP files from front to back, for those that rosbags refuses: cut off, or without a ROS 2 profile."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -16,21 +16,21 @@ from app.slam.errors import printable
 
 
 class McapStream:
-    """Topics and messages of a file, as far as it reaches. Needs no index, no summary and no end.
+    """Topics and messages of the pieces of a recording, as far as each reaches. Needs no index, no summary and no end.
 
     Attributes:
         counts: topic -> (type as in ROS 2, number of messages). start_ns, end_ns: log times.
-        complete: whether the file has its end.
+        cut: the pieces without an end, in order of time.
     """
 
     by_log_time = False
 
-    def __init__(self, path: Path) -> None:
-        """Reads the file once, to count."""
-        self._path = path
+    def __init__(self, pieces: Sequence[Path]) -> None:
+        """Reads the files once, to count."""
         self._deserialiser = Deserialiser()
         self.counts: dict[str, tuple[str, int]] = {}
-        self.complete = False
+        self.cut: list[Path] = []
+        self._pieces = sorted(pieces, key=self._begin)
         times: tuple[int, int] | None = None
         for topic, kind, log_ns, _, _ in self._records():
             self.counts[topic] = (kind, self.counts.get(topic, (kind, 0))[1] + 1)
@@ -41,22 +41,30 @@ class McapStream:
         """(topic, log time ns, deserialised message), in the order of the file.
 
         Raises:
-            EndOfFile: where the file is cut off, if messages up to `stop_ns` might have followed.
+            EndOfFile: where the last piece is cut off, if messages up to `stop_ns` might have followed.
         """
         for topic, kind, log_ns, encoding, data in self._records():
             if topic in topics and start_ns <= log_ns < stop_ns:
                 yield topic, log_ns, self._deserialiser.read(data, kind, encoding)
-        if not self.complete and stop_ns > self.end_ns:
+        if self._pieces[-1] in self.cut and stop_ns > self.end_ns:
             raise EndOfFile("the file ends here, in the middle of a record")
 
     def close(self) -> None:
         """Nothing stays open between two readings."""
 
+    def _begin(self, piece: Path) -> int:
+        """Log time of its first message; 0 without any."""
+        return next((log_ns for _, _, log_ns, _, _ in self._records_of(piece)), 0)
+
     def _records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
+        for piece in self._pieces:
+            yield from self._records_of(piece)
+
+    def _records_of(self, piece: Path) -> Iterator[tuple[str, str, int, str, bytes]]:
         """(topic, type, log time, encoding, bytes) up to the end or to where the file is cut."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, tuple[str, str, str]] = {}  # topic, type, encoding
-        with self._path.open("rb") as file:
+        with piece.open("rb") as file:
             try:
                 for record in _unpacked(file):
                     if isinstance(record, Schema):
@@ -70,8 +78,8 @@ class McapStream:
                         topic, kind, encoding = channels[record.channel_id]
                         yield topic, kind, record.log_time, encoding, record.data
             except (EndOfFile, McapError, struct.error):  # the last of a record that is cut in its middle
-                return
-        self.complete = True
+                if piece not in self.cut:
+                    self.cut.append(piece)
 
 
 def _unpacked(file: IO[bytes]) -> Iterator[McapRecord]:

@@ -211,22 +211,28 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
 
 
 def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Finding, ...]] | None:
-    """A single MCAP read from front to back, if that yields anything."""
-    inner = sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files
-    if len(inner) != 1 or inner[0].suffix.lower() != ".mcap":
+    """MCAP files read from front to back, if that yields anything."""
+    pieces = sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files
+    if not pieces or any(piece.suffix.lower() != ".mcap" for piece in pieces):
         return None
     try:
-        stream = McapStream(inner[0])
+        stream = McapStream(pieces)
     except Exception:  # whatever a damaged file may cause: the first error is the one to report
         return None
     if not stream.counts:
         return None
-    if stream.complete:
+    if not stream.cut:
         return stream, (
             Finding("file", "corrected", f"read from front to back, since its index cannot be used ({why})"),
         )
     length = (stream.end_ns - stream.start_ns) / 1e9
-    text = f"the file is cut off {length:.1f} s after its start ({why}); what comes before is used"
+    if len(pieces) == 1:
+        text = f"the file is cut off {length:.1f} s after its start ({why}); what comes before is used"
+    else:
+        names = ", ".join(piece.name for piece in stream.cut)
+        text = (
+            f"of {len(pieces)} files, {names} is cut off ({why}); what comes before that is used, {length:.1f} s in all"
+        )
     return stream, (Finding("file", "needs you", text),)
 
 

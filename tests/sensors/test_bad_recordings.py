@@ -1,6 +1,7 @@
 """What cannot be used is refused in one sentence that says what, where and what to do."""
 
 import sqlite3
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,6 +77,27 @@ def test_a_cut_mcap_is_read_up_to_the_cut_and_says_so(tmp_path: Path) -> None:
             used.extend(entry for entry in recording.measurements() if isinstance(entry, Measurement))
     assert 10 <= len(used) <= 21
     np.testing.assert_array_equal(used[5].scan.points, rig.turn(5, columns=30).points)
+
+
+@pytest.mark.parametrize(("cut", "used", "ends_early"), [(1, 30, True), (0, 30, False)])
+def test_a_recording_in_pieces_of_which_one_is_cut_is_read_around_the_cut(
+    tmp_path: Path, cut: int, used: int, ends_early: bool
+) -> None:
+    """As a recorder leaves it that lost its power: without metadata.yaml. Names tell nothing about the order."""
+    entries = sorted(rig.walk(turns=40, columns=30), key=lambda entry: entry[1])
+    half = next(n for n, (_, log_ns, _) in enumerate(entries) if log_ns >= rig.START_NS + 20 * rig.PERIOD_NS)
+    pieces = [
+        rig.write(tmp_path / name, part, "small-chunks")
+        for name, part in (("walk_9", entries[:half]), ("walk_10", entries[half:]))
+    ]
+    pieces[cut].write_bytes(pieces[cut].read_bytes()[: pieces[cut].stat().st_size // 2])
+    found = 0
+    with open_recording(tmp_path, Params()) as recording:
+        assert any(f"{pieces[cut].name} is cut off" in finding.text for finding in recording.findings)
+        with pytest.raises(HemislamError, match="ends here") if ends_early else nullcontext():
+            for entry in recording.measurements():
+                found += isinstance(entry, Measurement)
+    assert abs(found - used) <= 3
 
 
 def test_an_mcap_without_the_ros2_profile_is_read_all_the_same(tmp_path: Path) -> None:
