@@ -142,9 +142,12 @@ def _acceleration_unit(norm: float, chosen: str) -> tuple[float, list[Finding]]:
     if fitting is not None:
         text = f"{fitting}: {text}; scaled to m/s²"
         return ACCELERATION_UNITS[fitting], [Finding("IMU units", "corrected", text, option + fitting)]
-    nearest = min(ACCELERATION_UNITS, key=lambda unit: abs(np.log(norm * ACCELERATION_UNITS[unit] / STANDARD_GRAVITY)))
-    text = f"{text}, gravity in none of {', '.join(ACCELERATION_UNITS)}; taken as {nearest}: check the IMU's driver"
-    return ACCELERATION_UNITS[nearest], [Finding("IMU units", "needs you", text)]
+    text = f"{text}, gravity in none of {', '.join(ACCELERATION_UNITS)}"
+    for unit, scale in ACCELERATION_UNITS.items():
+        if 6.5 < norm * scale < 15.0:
+            return scale, [Finding("IMU units", "needs you", f"{text}; taken as {unit}: check the IMU's driver")]
+    text += "; taken as m/s²: record the raw acceleration, if the driver takes gravity off it or sends bare counts"
+    return 1.0, [Finding("IMU units", "needs you", text)]
 
 
 def _gyroscope_unit(gyro: F64, sway: "Sway | None", chosen: str) -> tuple[float, list[Finding]]:

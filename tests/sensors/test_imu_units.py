@@ -40,7 +40,11 @@ def carried() -> ImuProbe:
         (9.79, "auto", 1.0, "fine"),
         (9.79, "m/s2", 1.0, "fine"),
         (9.79, "g", G, "needs you"),
+        (13.0, "auto", 1.0, "needs you"),
+        (1.4, "auto", G, "needs you"),
         (5.0, "auto", 1.0, "needs you"),
+        (1.7, "auto", 1.0, "needs you"),  # a walk without gravity
+        (16384.0, "auto", 1.0, "needs you"),  # bare counts
     ],
 )
 def test_the_unit_of_acceleration_is_known_by_gravity(norm: float, chosen: str, scale: float, verdict: str) -> None:
