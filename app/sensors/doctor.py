@@ -156,11 +156,12 @@ def _rate(subject: str, stamps: I64, least: float) -> Finding:
 
 
 def _pauses(scans: I64, imu: I64) -> F64:
-    """(m, 2) s, when each time without scans and IMU samples begins, from the first stamp on, and how long it lasts."""
-    stamps = np.sort(np.concatenate([scans[:, 1:].ravel(), imu[:, 1]]))
-    if not len(stamps):
+    """(m, 2) s, when each time without scans and IMU samples begins, from the first scan on, and how long it lasts."""
+    if not len(scans):
         return np.empty((0, 2))
-    times = (stamps - stamps[0]) * 1e-9
+    begin, end = scans[:, 1].min(), scans[:, 2].max()
+    samples = imu[(imu[:, 1] > begin) & (imu[:, 1] < end), 1]
+    times = (np.sort(np.concatenate([scans[:, 1:].ravel(), samples])) - begin) * 1e-9
     lasts = np.diff(times)
     return np.asarray(np.column_stack([times[:-1], lasts])[lasts > PAUSE_S])
 

@@ -225,14 +225,12 @@ def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Fin
         return stream, (
             Finding("file", "corrected", f"read from front to back, since its index cannot be used ({why})"),
         )
-    length = (stream.end_ns - stream.start_ns) / 1e9
     if len(pieces) == 1:
+        length = (stream.end_ns - stream.start_ns) / 1e9
         text = f"the file is cut off {length:.1f} s after its start ({why}); what comes before is used"
     else:
         names = ", ".join(piece.name for piece in stream.cut)
-        text = (
-            f"of {len(pieces)} files, {names} is cut off ({why}); what comes before that is used, {length:.1f} s in all"
-        )
+        text = f"{len(stream.cut)} of {len(pieces)} files cut off ({names}: {why}); what they hold before that is used"
     return stream, (Finding("file", "needs you", text),)
 
 

@@ -20,8 +20,7 @@ READOUTS = (
 """Numbers of one frame, nan where there is none. `used` points were looked up in the map. `degeneracy` is the smallest
 eigenvalue of the pose information. `predicted_change` and `correction`, of the velocity by the IMU and by the update,
 are in m/s. `surprise` is as in `Registration`; `imu_gap_s`, `dropped`, `clock_late_s` and `position_sigma` are as in
-`StepResult`.
-`speed` is in m/s. The biases are norms. `turn_*` is the rotation vector (rad) of R_odom_imu."""
+`StepResult`. `speed` is in m/s. The biases are norms. `turn_*` is the rotation vector (rad) of R_odom_imu."""
 
 FRAME = np.dtype(
     [
