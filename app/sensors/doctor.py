@@ -180,8 +180,8 @@ def _of_pauses(pauses: F64) -> list[Finding]:
 
 def _imu_gaps(counts: Counts, limit_s: float, pauses: int) -> Finding:
     if counts.imu_gaps <= pauses:
-        beside = " beside the pauses of the recording" if pauses else ""
-        return Finding("IMU gaps", "fine", f"none longer than {limit_s:g} s{beside}")
+        pauses_apart = " apart from the pauses" if pauses else ""
+        return Finding("IMU gaps", "fine", f"none longer than {limit_s:g} s{pauses_apart}")
     longest = counts.longest_imu_gap_s
     text = (
         f"{counts.imu_gaps} longer than {limit_s:g} s, the longest {longest:.3f} s; "

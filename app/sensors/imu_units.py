@@ -144,7 +144,7 @@ def _acceleration_unit(norm: float, chosen: str) -> tuple[float, list[Finding]]:
         return ACCELERATION_UNITS[fitting], [Finding("IMU units", "corrected", text, option + fitting)]
     text = f"{text}, gravity in none of {', '.join(ACCELERATION_UNITS)}"
     for unit, scale in ACCELERATION_UNITS.items():
-        if 6.5 < norm * scale < 15.0:
+        if 6.5 < norm * scale < 15.0:  # a recording that begins amid walking may show so little or so much
             return scale, [Finding("IMU units", "needs you", f"{text}; taken as {unit}: check the IMU's driver")]
     text += "; taken as m/s²: record the raw acceleration, if the driver takes gravity off it or sends bare counts"
     return 1.0, [Finding("IMU units", "needs you", text)]

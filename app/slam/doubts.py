@@ -59,7 +59,7 @@ def doubts(log: RunLog, tied_ns: I64 = NO_PAUSES) -> tuple[str, ...]:
         *found,
         *_of_pauses(log, times, tied_ns),
         *_of_silence(log, times),
-        *_of_openness(log, times),
+        *_of_unobserved(log, times),
         *_of_clock(log),
         *of_sensors,
     )
@@ -93,16 +93,16 @@ def _of_silence(log: RunLog, times: F64) -> list[str]:
     ]
 
 
-def _of_openness(log: RunLog, times: F64) -> list[str]:
-    """Whether the scans leave one direction open for so long that the IMU cannot tell the position along it."""
+def _of_unobserved(log: RunLog, times: F64) -> list[str]:
+    """Whether the scans leave a direction unobserved for so long that the IMU cannot tell the position along it."""
     sigma = log.readout("position_sigma")
     uncertain = (sigma > UNCERTAIN) & ~(log.readout("imu_gap_s") > LONG_GAP)
     if np.count_nonzero(uncertain) < OFTEN:
         return []
     return [
-        f"In {np.count_nonzero(uncertain)} frames the scans leave one direction open{_since(times, uncertain)}; the "
-        f"position along it is uncertain by up to {sigma[uncertain].max():.1f} m (one standard deviation). If the map "
-        "is off from then on, add a loop by hand."
+        f"In {np.count_nonzero(uncertain)} frames the scans leave a direction unobserved{_since(times, uncertain)}. "
+        f"The position along it is uncertain by up to {sigma[uncertain].max():.1f} m (one standard deviation). If the "
+        "map is off from then on, add a loop by hand."
     ]
 
 

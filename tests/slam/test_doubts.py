@@ -116,4 +116,4 @@ def test_a_position_that_the_filter_itself_does_not_know_is_reported() -> None:
     sure, unsure = (log(WALK, position_sigma=value, imu_gap_s=0.005).frames for value in (0.03, 0.44))
     assert doubts(RunLog([*sure[:50], *unsure[50:52], *sure[52:]])) == ()
     (doubt,) = doubts(RunLog([*sure[:50], *unsure[50:59], *sure[59:]]))
-    assert "In 9 frames the scans leave one direction open, first at 5.0 s" in doubt and "up to 0.4 m" in doubt
+    assert "In 9 frames the scans leave a direction unobserved, first at 5.0 s" in doubt and "up to 0.4 m" in doubt

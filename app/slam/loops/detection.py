@@ -98,7 +98,7 @@ class Detector:
         return self._resumed[: len(self)]
 
     @property
-    def pieces(self) -> I64:
+    def pauses_before(self) -> I64:
         """(k,) number of pauses before each."""
         return np.cumsum(self.resumed)
 

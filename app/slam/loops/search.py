@@ -190,8 +190,8 @@ class Search:
             fresh = {edge.pair: edge for edge in self._judged(newer, expectation, params) if edge.pair not in known}
             known, settled = known | fresh, list(fresh.values())
             if any(edge.verdict is Verdict.CANDIDATE for edge in settled):
-                settled = settle(fresh, known, detector.poses, detector.pieces, drift, params, now)
-                settled = placed(settled, known.values(), detector.poses, poses, detector.pieces, detector.half)
+                settled = settle(fresh, known, detector.poses, detector.pauses_before, drift, params, now)
+                settled = placed(settled, known.values(), detector.poses, poses, detector.pauses_before, detector.half)
             updates.update((edge.pair, edge) for edge in settled)
             known.update(updates)
         contexts = tuple(detector.context(index) for index in range(first, keyframes.stop))

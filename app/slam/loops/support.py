@@ -37,7 +37,7 @@ def settle(
     fresh: Mapping[Pair, LoopEdge],
     edges: Mapping[Pair, LoopEdge],
     poses: F64,
-    pieces: I64,
+    pauses_before: I64,
     drift: Drift,
     params: LoopsParams,
     now: int,
@@ -47,12 +47,12 @@ def settle(
     Args:
         fresh: new candidates with a verdict on each alone. edges: all, including those, as they count with the
             user's edits. A candidate that the user decided on is left alone.
-        poses: (k, 4, 4) T_odom_imu. pieces: (k,) number of pauses before each. now: newest keyframe.
+        poses: (k, 4, 4) T_odom_imu. pauses_before: (k,) their number, of each. now: newest keyframe.
 
     Returns:
         All of `fresh`, and earlier candidates whose verdict changed, without the user's edits.
     """
-    walked = walked_m(poses[:, :3, 3]) + pieces * ELSEWHERE_M
+    walked = walked_m(poses[:, :3, 3]) + pauses_before * ELSEWHERE_M
 
     def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:
         return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))
@@ -111,7 +111,12 @@ def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
 
 
 def placed(
-    settled: Iterable[LoopEdge], edges: Iterable[LoopEdge], T_odom_imu: F64, T_map_imu: F64, pieces: I64, half: int
+    settled: Iterable[LoopEdge],
+    edges: Iterable[LoopEdge],
+    T_odom_imu: F64,
+    T_map_imu: F64,
+    pauses_before: I64,
+    half: int,
 ) -> list[LoopEdge]:
     """The same candidates; accepted ones name the loop that represents them or that they repeat, if there is one.
 
@@ -122,14 +127,18 @@ def placed(
       two, is represented by that tie. Otherwise the graph would grow denser with every visit to a place.
 
     Args:
-        edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). pieces: (k,) number of pauses before each keyframe;
-            only loops between the same pieces are compared. half: of a submap, in keyframes.
+        edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). pauses_before: (k,) their number, of each;
+            only loops with equal numbers at both ends are compared. half: of a submap, in keyframes.
     """
     counting = {edge.pair: edge for edge in edges if edge.counts}
     out = []
     for edge in settled:
         if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
-            alike = [other for other in counting.values() if (pieces[[*other.pair]] == pieces[[*edge.pair]]).all()]
+            alike = [
+                other
+                for other in counting.values()
+                if (pauses_before[[*other.pair]] == pauses_before[[*edge.pair]]).all()
+            ]
             edge = _placed(edge, alike, T_odom_imu, T_map_imu, half)
             if edge.counts:
                 counting[edge.pair] = edge

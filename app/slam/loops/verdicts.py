@@ -67,7 +67,7 @@ def judge(
         mahalanobis=found.deviation.sigmas,
     )
     T = _imu(detector, older, newer, fit.T_target_source)
-    paused = detector.pieces[older] < detector.pieces[newer]
+    paused = detector.pauses_before[older] < detector.pauses_before[newer]
     reason = _objection(found, evidence, params, FAR_M if paused else NEAR_M) or (
         "" if broken else _far_off(found.deviation, evidence, params)
     )
