@@ -69,10 +69,14 @@ class TransportPanel:
             self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
     def _asked(self, word: str) -> None:
-        """What the page's script sends: "play", "step -1", "seek 812", "speed 2×", "ends 0 80"."""
+        """What the page's script sends: "play", "pause", "resume", "step -1", "seek 812", "speed 2×", "ends 0 80"."""
         match word.split(" ", 1):
             case ["play"]:
                 self.toggle()
+            case ["pause"]:
+                self._send(Pause())
+            case ["resume"]:
+                self._send(Play())
             case ["step", ("1" | "-1") as frames]:
                 self._send(StepFrame(int(frames)))
             case ["seek", frame] if frame.isdecimal():

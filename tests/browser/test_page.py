@@ -271,6 +271,7 @@ def test_two_browsers_see_one_session_and_reach_out_to_nobody_else(bench: Bench,
 
 def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -> None:
     page = new_page(chromium, 1000, 620, tour=True)
+    bench.engine.send(SetSpeed(0.1))  # not at its end before the tour is
     bench.engine.send(Play())
     try:
         page.goto(bench.url)

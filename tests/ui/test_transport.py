@@ -47,6 +47,12 @@ def test_the_play_button_plays_then_pauses(transport: Transporting) -> None:
     assert transport.engine.sent == [Play(), Pause()]
 
 
+def test_pause_and_resume_of_the_tour_do_not_depend_on_what_the_page_believes(transport: Transporting) -> None:
+    for word in ("pause", "resume", "resume"):
+        transport.says(word)
+    assert transport.engine.sent == [Pause(), Play(), Play()] and transport.shown["playing"]
+
+
 def test_the_track_follows_the_frame_and_ends_at_the_last(transport: Transporting) -> None:
     assert transport.shown["frame"] == 0
     transport.engine.send(StepFrame(7))

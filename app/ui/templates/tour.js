@@ -22,12 +22,11 @@ if (!window.hemislamTour) {
     };
     const timer = setInterval(outline, 500);
     const playing = () => { const now = JSON.parse(document.querySelector('.hs-state').dataset.state); return now.playing && !now.live; };
-    const toggle = () => document.querySelector('body > * .hs-play')?.click();
     const held = playing(); // nothing runs on behind what is read
-    if (held) toggle();
+    if (held) window.hemislamTransport('pause');
     const end = () => {
       clearInterval(timer); outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key);
-      if (held && !playing()) toggle();
+      if (held) window.hemislamTransport('resume');
     };
     const key = (event) => { if (event.key === 'Escape') end(); };
     const show = () => {

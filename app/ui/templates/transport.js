@@ -21,6 +21,7 @@ const tell = (word) => {
   window.hemislamSay({type: 'click', target: dock});
   delete dock.dataset.hs;
 };
+window.hemislamTransport = tell;
 
 const unpack = (data) => new Float32Array(Uint8Array.from(atob(data), (c) => c.charCodeAt(0)).buffer);
 const read = () => {
