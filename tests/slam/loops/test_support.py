@@ -225,9 +225,10 @@ def test_with_a_window_each_loop_is_between_its_own_keyframes() -> None:
 SLIPPED = Evidence(overlap=0.8, residual_rms=0.03, slide=0.01, mahalanobis=9.0, gate_m=0.1, alternative_m=np.inf)
 
 
-def judged(loops: list[LoopEdge], evidence: Evidence = SLIPPED) -> dict[int, LoopEdge]:
-    """By their older ends, once all are there; odometry walks as `POSES`."""
-    found = {edge.pair: replace(edge, verdict=Verdict.CANDIDATE, evidence=evidence) for edge in loops}
+def judged(loops: list[LoopEdge], evidence: Evidence = SLIPPED, *others: LoopEdge) -> dict[int, LoopEdge]:
+    """By their older ends, once all are there, others with evidence of their own; odometry walks as `POSES`."""
+    found = {edge.pair: replace(edge, evidence=evidence) for edge in loops} | {edge.pair: edge for edge in others}
+    found = {pair: replace(edge, verdict=Verdict.CANDIDATE) for pair, edge in found.items()}
     settled = settle(
         found, found, POSES, PIECES[: len(POSES)], Drift(0.01, 0.002, np.radians(0.02)), LoopsParams(), 2 * TURN - 1
     )
@@ -243,6 +244,18 @@ def test_one_loop_against_odometry_stays_undecided_and_says_so() -> None:
 def test_loops_that_agree_over_a_stretch_outvote_odometry() -> None:
     edges = judged([loop(older) for older in range(40, 34, -1)])
     assert all(edge.verdict is Verdict.ACCEPTED and "outvote odometry" in edge.reason for edge in edges.values())
+
+
+@pytest.mark.parametrize(("sigmas", "outvote"), [(5.0, False), (12.0, True)])
+def test_a_longer_loop_to_another_place_keeps_others_from_outvoting_odometry_that_likes_it_better(
+    sigmas: float, outvote: bool
+) -> None:
+    """Of places that look alike, the one that needs less drift over more odometry is likelier."""
+    rival = replace(loop(10), newer=loop(38).newer, evidence=replace(SLIPPED, mahalanobis=sigmas))
+    edges = judged([loop(older) for older in range(40, 34, -1)], SLIPPED, rival)
+    assert edges.pop(10).verdict is Verdict.CANDIDATE
+    assert {edge.verdict for edge in edges.values()} == {Verdict.ACCEPTED if outvote else Verdict.CANDIDATE}
+    assert all(("likelier" in edge.reason) != outvote for edge in edges.values())
 
 
 def test_loops_that_agree_at_one_spot_do_not_outvote_odometry() -> None:
