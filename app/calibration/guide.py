@@ -17,15 +17,13 @@ class Guide:
     """Motion by the IMU.
 
     Attributes:
-        knots: (m,) s. attitudes: (m, 3, 3) of the IMU at these, in any one frame. rates: (m, 3) rad/s, forces: (m, 3)
-            m/s², IMU frame, without biases.
+        inertial: samples at knots `STEP_S` apart by the LiDAR's clock, without biases. attitudes: (m, 3, 3) of the IMU
+            at these, in any one frame.
         R_imu_lidar: (3, 3). p_imu_lidar: (3,) m. gravity: (3,) m/s² in the world of the odometry; None: unknown.
     """
 
-    knots: F64
+    inertial: Inertial
     attitudes: F64
-    rates: F64
-    forces: F64
     R_imu_lidar: F64
     p_imu_lidar: F64
     gravity: F64 | None
@@ -37,15 +35,10 @@ class Guide:
     ) -> "Guide":  # fmt: skip
         knots = np.arange(inertial.times[0] + late, inertial.times[-1] + late + STEP_S, STEP_S)
         zero = np.zeros(3)
-        return cls(
-            knots,
-            inertial.attitudes(knots, late, gyro_bias),
-            inertial.rates(knots - late) - gyro_bias,
-            inertial.forces(knots - late) - (zero if accel_bias is None else accel_bias),
-            R_imu_lidar,
-            zero if p_imu_lidar is None else p_imu_lidar,
-            gravity,
-        )
+        forces = inertial.forces(knots - late) - (zero if accel_bias is None else accel_bias)
+        steady = Inertial(knots, inertial.rates(knots - late) - gyro_bias, forces)
+        attitudes = inertial.attitudes(knots, late, gyro_bias)
+        return cls(steady, attitudes, R_imu_lidar, zero if p_imu_lidar is None else p_imu_lidar, gravity)
 
     def course(self, end: float, back: F64, R_world_lidar: F64) -> Course:
         """How the LiDAR came to its pose at the time `end` s.
@@ -67,9 +60,8 @@ class Guide:
         if self.gravity is None:
             return nothing, nothing
         turned, at = self._turned(end, back)
-        forces = np.stack([np.interp(end + back, self.knots, self.forces[:, i]) for i in range(3)], axis=1)
         R_world_imu = R_world_lidar @ self.R_imu_lidar.T
-        felt = (turned @ forces[:, :, None])[:, :, 0] + R_world_imu.T @ self.gravity
+        felt = (turned @ self.inertial.forces(end + back)[:, :, None])[:, :, 0] + R_world_imu.T @ self.gravity
         h = np.diff(back)[:, None]
         speeds, ways = nothing.copy(), nothing.copy()  # of the IMU, integrated back from the end
         for k in range(len(back) - 2, -1, -1):
@@ -84,9 +76,9 @@ class Guide:
 
     def _turned(self, end: float, back: F64) -> tuple[F64, F64]:
         """(k, 3, 3) R_end_then of the IMU, and its rates (k, 3) then."""
-        times = end + back
-        k = np.clip(np.searchsorted(self.knots, times) - 1, 0, len(self.knots) - 2)
-        rates = np.stack([np.interp(times, self.knots, self.rates[:, i]) for i in range(3)], axis=1)
-        middle = 0.5 * (self.rates[k] + rates)
-        then = self.attitudes[k] @ lie.exp(middle * (times - self.knots[k])[:, None])
+        times, knots = end + back, self.inertial.times
+        k = np.clip(np.searchsorted(knots, times) - 1, 0, len(knots) - 2)
+        rates = self.inertial.rates(times)
+        middle = 0.5 * (self.inertial.gyro[k] + rates)
+        then = self.attitudes[k] @ lie.exp(middle * (times - knots[k])[:, None])
         return np.asarray(then[-1].T @ then), rates

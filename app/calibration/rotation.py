@@ -139,13 +139,18 @@ def windows_of(track: Track, length: int) -> I64:
     return windows[lasting < 1.5 * np.median(lasting)]
 
 
+def chained(first: F64, turns: F64, windows: I64) -> F64:
+    """(w, n, 3, 3) attitudes at the scans of each window, from the first (w, 3, 3) on by turns from scan to scan."""
+    attitudes = np.empty((*windows.shape, 3, 3))
+    attitudes[:, 0] = first
+    for k in range(1, windows.shape[1]):
+        attitudes[:, k] = attitudes[:, k - 1] @ turns[windows[:, k] - 1]
+    return attitudes
+
+
 def _differences(track: Track, inertial: Inertial, R: F64, late: float, bias: F64, windows: I64) -> F64:
     """(w, WINDOW, 3) rad, world: attitudes by scans against those by gyroscope, less the mean of each window."""
-    turns = R.T @ inertial.turns(track.times, late, bias) @ R
     ours = track.rotations[windows]
-    theirs = np.empty_like(ours)
-    theirs[:, 0] = ours[:, 0]
-    for k in range(1, windows.shape[1]):
-        theirs[:, k] = theirs[:, k - 1] @ turns[windows[:, k] - 1]
+    theirs = chained(ours[:, 0], R.T @ inertial.turns(track.times, late, bias) @ R, windows)
     off = lie.log(ours @ np.swapaxes(theirs, 2, 3))
     return np.asarray(off - off.mean(axis=1, keepdims=True))

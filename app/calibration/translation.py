@@ -10,7 +10,7 @@ import numpy as np
 
 from app.calibration.inertial import SUBSTEPS, Inertial
 from app.calibration.odometry import Track
-from app.calibration.rotation import Turned, clustered, windows_of
+from app.calibration.rotation import Turned, chained, clustered, windows_of
 from app.slam import lie
 from app.slam.types import F64, I64
 
@@ -104,13 +104,8 @@ def _integrated(track: Track, inertial: Inertial, turned: Turned, windows: I64) 
     (w, n, 3) m, and how a bias changes that (w, n, 3, 3)."""
     w, n = windows.shape
     times = track.times[windows]
-    here = track.rotations[windows[:, 0]] @ turned.R_imu_lidar.T
-    turns = inertial.turns(track.times, turned.late, turned.bias)
-    attitudes = np.empty((w, n, 3, 3))
-    attitudes[:, 0] = here
-    for k in range(1, n):
-        attitudes[:, k] = attitudes[:, k - 1] @ turns[windows[:, k] - 1]
     seen = track.rotations[windows] @ turned.R_imu_lidar.T
+    attitudes = chained(seen[:, 0], inertial.turns(track.times, turned.late, turned.bias), windows)
     off = lie.log(seen @ np.swapaxes(attitudes, 2, 3)).mean(axis=1)
     attitudes = lie.exp(off)[:, None] @ attitudes
 
