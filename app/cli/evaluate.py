@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Duration, Imperfect, ParamsFor, Short, Suite, make_folder, with_params
+from app.cli.options import Duration, Imperfect, ParamsFor, Short, Suite, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
+from app.slam.text_files import make_folder
 
 if TYPE_CHECKING:
     from app.evaluation.runner import RunJobs

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from app.slam.errors import HemislamError
-
 if TYPE_CHECKING:
     from app.slam.params import Params
 
@@ -147,11 +145,3 @@ def progress_bar(description: str, **options: Any) -> Iterator[Callable[..., Non
             bar.update(done - bar.n)
 
         yield show
-
-
-def make_folder(folder: Path) -> None:
-    """Raises HemislamError if the folder cannot be created."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HemislamError(f"The folder {folder} cannot be created: {error.strerror}; choose another one.") from None

@@ -26,7 +26,6 @@ from app.slam.errors import HemislamError
 if TYPE_CHECKING:
     from app.calibration.calibrate import Calibration
     from app.mapping.session import Session
-    from app.slam.loops.edits import LoopEdit
     from app.slam.params import Params
 
 UNASKED_S = 60.0
@@ -70,11 +69,13 @@ def run(
     from app.export.results import prepare_folder
     from app.mapping.opening import open_session
     from app.slam.doubts import doubts
+    from app.slam.loops import edit_files
     from app.slam.trajectory import truth_beside
+    from app.slam.user_text import read_text
 
     params = params_for(recording)
     say_calibrated(recording)
-    edits = _read_edits(loops) if loops else ()
+    edits = edit_files.read(read_text(loops, "save edits of loops in the workbench"), str(loops)) if loops else ()
     params, advised = settle_mounting(recording, params) if calibrate else (params, "")
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
@@ -186,17 +187,6 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     if stop is not None:
         typer.echo(f"hemislam: stopped early; the frames so far are saved in {folder}.", err=True)
         raise stop
-
-
-def _read_edits(path: Path) -> "tuple[LoopEdit, ...]":
-    from app.slam.loops import edit_files
-
-    try:
-        return edit_files.read(path.read_text(encoding="utf-8"), str(path))
-    except UnicodeDecodeError:
-        raise HemislamError(f"{path} is not a text file; save edits of loops in the workbench.") from None
-    except OSError as error:
-        raise HemislamError(f"{path} cannot be read: {error.strerror}.") from None
 
 
 def free_folder(recording: Path) -> Path:

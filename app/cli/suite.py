@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from app.cli.options import make_folder, progress_bar
+from app.cli.options import progress_bar
+from app.slam.text_files import make_folder
 
 if TYPE_CHECKING:
     from app.sensors.simulator.imperfections import Imperfections

@@ -17,9 +17,10 @@ from app.cli.evaluate import (
     runner,
     truth_texts,
 )
-from app.cli.options import Duration, ParamsFor, make_folder, with_params
+from app.cli.options import Duration, ParamsFor, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
+from app.slam.text_files import make_folder
 
 
 @with_params

@@ -30,6 +30,7 @@ from app.slam.map_frame import NO_PAUSES, MapFrame
 from app.slam.ply import Keyframes
 from app.slam.provenance import hash_input
 from app.slam.run_log import RunInfo, RunLog
+from app.slam.text_files import make_folder, write_texts
 from app.slam.trajectory import Trajectory, stamp_text, write_tum
 from app.slam.types import F64, I64, TIMINGS
 
@@ -263,10 +264,7 @@ def prepare_folder(folder: Path, *, replace: bool = False) -> None:
         raise HemislamError(
             f"{folder} already holds results ({', '.join(held)}); choose another folder or add --force."
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HemislamError(f"The folder {folder} cannot be made: {error.strerror}; choose another one.") from None
+    make_folder(folder)
     if not os.access(folder, os.W_OK | os.X_OK):
         raise HemislamError(f"The folder {folder} is not writable; choose another one.")
 
@@ -297,8 +295,8 @@ def save_results(
         if {"map.ply", "trajectory.tum"} & parts.keys() and (results.where is None or results.found is not None):
             for name in (reference.FILE, reference.RESIDUALS, reference.PLOT):
                 (folder / name).unlink(missing_ok=True)  # of an older map
-            for name, text in ledger.files(results.found).items() if results.found is not None else ():
-                (folder / name).write_text(text, encoding="utf-8")
+            if results.found is not None:
+                write_texts(folder, ledger.files(results.found))
         for export in exports:
             if export in written:
                 parts[export.name].replace(folder / export.name)

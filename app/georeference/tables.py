@@ -14,6 +14,7 @@ from app.georeference.fixes import Fixes
 from app.georeference.reference import ELLIPSOIDAL
 from app.slam.arrays import F64
 from app.slam.errors import HemislamError
+from app.slam.user_text import read_text
 
 GEOID = "orthometric (geoid of the receiver)"
 LEAP_S, WEEK_S, GPS_EPOCH_S = 18, 604_800, 315_964_800
@@ -69,7 +70,7 @@ class NamedColumns:
 
 def read_table(path: Path, *wanted: str) -> NamedColumns:
     """As `table_of`, of a file. Raises HemislamError as well if it cannot be read."""
-    return table_of(_lines(path), str(path), *wanted)
+    return table_of(read_text(path, "save it as CSV").splitlines(), str(path), *wanted)
 
 
 def table_of(lines: Sequence[str], source: str, *wanted: str) -> NamedColumns:
@@ -113,7 +114,8 @@ def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
     Raises:
         HemislamError: it cannot be read, or is none of these.
     """
-    lines = _lines(path, errors="replace")  # a log may hold binary messages beside the sentences
+    text = read_text(path, "give NMEA or CSV", errors="replace")  # a log may hold binary messages beside the sentences
+    lines = text.splitlines()
     if any(line.lstrip().startswith("$G") for line in lines[:50]):
         fixes, ellipsoidal = nmea.read(lines, str(path), near_ns)
         return fixes.sound(str(path)), ELLIPSOIDAL if ellipsoidal else GEOID
@@ -128,15 +130,6 @@ def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
     sigmas = table.numbers(*names) if table.has(*names) else None
     fixes = Fixes.of(stamps, table.numbers("latitude", "longitude", "height"), sigmas)
     return fixes.sound(str(path)), ELLIPSOIDAL
-
-
-def _lines(path: Path, *, errors: str = "strict") -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8-sig", errors=errors).splitlines()
-    except UnicodeDecodeError:
-        raise HemislamError(f"{path} is not a text file.") from None
-    except OSError as error:
-        raise HemislamError(f"{path} cannot be read: {error.strerror}.") from None
 
 
 def _plain(title: str) -> str:

@@ -44,6 +44,7 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
 from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
+from app.slam.text_files import make_folder, write_texts
 
 log = logging.getLogger(__name__)
 
@@ -226,16 +227,8 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
 def write_session(path: Path, session: SavedSession) -> None:
     """Write a session file as a whole; its folder need not exist yet. Raises HemislamError: that is not possible."""
     entries = (_head(session.opened), _entry(session.frame, session.ended, session.known, session.state))
-    lines = [json.dumps(entry, ensure_ascii=False) + "\n" for entry in entries]
-    part = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text("".join(lines), encoding="utf-8", errors="backslashreplace")
-        part.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise HemislamError(f"The session cannot be written to {path}: {error.strerror}.") from error
+    make_folder(path.parent)
+    write_texts(path.parent, {path.name: "".join(json.dumps(entry, ensure_ascii=False) + "\n" for entry in entries)})
 
 
 def read_session(path: Path) -> SavedSession:

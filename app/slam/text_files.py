@@ -1,5 +1,6 @@
 """Text files that this program writes: tables as CSV, and files that are complete or not there."""
 
+import contextlib
 import csv
 import io
 from collections.abc import Iterable, Mapping
@@ -15,13 +16,24 @@ def csv_text(*rows: Iterable[object]) -> str:
     return text.getvalue()
 
 
+def make_folder(folder: Path) -> None:
+    """Raises HemislamError if the folder cannot be created."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HemislamError(f"The folder {folder} cannot be made: {error.strerror}; choose another one.") from None
+
+
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
     """Write files by name; older ones stay until all are complete. Raises HemislamError: they cannot be written."""
     parts = {name: folder / f".{name}.part" for name in texts}
     try:
         for name, part in parts.items():
-            part.write_text(texts[name], encoding="utf-8")
+            part.write_text(texts[name], encoding="utf-8", errors="backslashreplace")  # a path may be no UTF-8
         for name, part in parts.items():
             part.replace(folder / name)
     except OSError as error:
+        for part in parts.values():
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
         raise HemislamError(f"{', '.join(texts)} cannot be written to {folder}: {error.strerror}.") from error

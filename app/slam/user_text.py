@@ -64,18 +64,26 @@ def read_numbers(texts: Iterable[str], names: Sequence[str], least: float = -mat
     return values
 
 
-def read_rows(path: Path, layout: str) -> TextRows:
-    """The rows of a file. `layout`: what its lines should be, for the error message.
+def read_text(path: Path, hint: str, *, errors: str = "strict") -> str:
+    """A file in UTF-8.
+
+    Args:
+        hint: what to do where it is no text, for the error message. errors: as `bytes.decode` has it.
 
     Raises:
         HemislamError: the file cannot be read or is not text.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        return path.read_text(encoding="utf-8-sig", errors=errors)
     except UnicodeDecodeError:
-        raise HemislamError(f"{path} is not a text file; {layout}.") from None
+        raise HemislamError(f"{path} is not a text file; {hint}.") from None
     except OSError as error:
         raise HemislamError(f"{path} cannot be read: {error.strerror}; check the path.") from None
+
+
+def read_rows(path: Path, layout: str) -> TextRows:
+    """The rows of a file. `layout`: what its lines should be, for the error message. Raises as `read_text`."""
+    lines = read_text(path, layout).splitlines()
     rows = [(number, line.partition("#")[0].split()) for number, line in enumerate(lines, 1)]
     return [(number, words) for number, words in rows if words]
 

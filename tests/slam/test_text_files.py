@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from app.slam.errors import HemislamError
-from app.slam.text_files import csv_text, write_texts
+from app.slam.text_files import csv_text, make_folder, write_texts
 
 
 def test_cells_with_commas_are_quoted() -> None:
@@ -12,13 +12,21 @@ def test_cells_with_commas_are_quoted() -> None:
 
 def test_no_file_is_replaced_unless_all_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("old")
-    (tmp_path / ".b.txt.part").mkdir()
+    (tmp_path / ".b.txt.part").mkdir()  # so that writing the second fails
     with pytest.raises(HemislamError, match=r"a.txt, b.txt cannot be written to"):
         write_texts(tmp_path, {"a.txt": "new", "b.txt": "new"})
     assert (tmp_path / "a.txt").read_text() == "old"
+    assert not (tmp_path / ".a.txt.part").exists(), "nothing half written is left"
 
 
 def test_files_hold_their_texts(tmp_path: Path) -> None:
     write_texts(tmp_path, {"a.txt": "α", "b.txt": "β"})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.txt", "b.txt"]
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "α"
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    make_folder(tmp_path / "a" / "b")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(HemislamError, match=r"file/c cannot be made: Not a directory"):
+        make_folder(tmp_path / "file" / "c")
