@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
+from scipy.ndimage import gaussian_filter1d  # type: ignore[attr-defined]  # scipy ships no types
+from scipy.spatial.transform import Rotation
 
 from app.slam.metrics import walked_m
 from app.slam.types import F64, I64, ImuSamples
@@ -42,7 +44,7 @@ class SmoothTrajectory:
     def poses(self, t: F64) -> tuple[F64, F64]:
         """Positions (n, 3) and rotations (n, 3, 3): R_world_imu, p_world_imu in reverse order."""
         values = self._spline(t)
-        return values[:, :3], _rotation(values[:, 3:]) @ self.R_body_imu
+        return values[:, :3], Rotation.from_euler("ZYX", values[:, 3:]).as_matrix() @ self.R_body_imu
 
     def motion(self, t: F64) -> tuple[F64, F64]:
         """What a perfect IMU reads: angular rate (n, 3) rad/s and specific force (n, 3) m/s^2, IMU frame."""
@@ -143,18 +145,18 @@ def walk(
     if not closed:
         travelled = _brake(travelled, arc[-1])
     places = places_at(travelled, arc, line)
-    xy = np.column_stack([_smoothed(places[:, k], 0.4 * _SAMPLE_HZ) for k in (0, 1)])
+    xy = np.column_stack([gaussian_filter1d(places[:, k], 0.4 * _SAMPLE_HZ, mode="nearest") for k in (0, 1)])
 
     # The walker looks half a metre ahead, and turns over about as much.
     step = 0.05
     s = np.arange(0.0, arc[-1], step)
     directions = np.unwrap(np.arctan2(*np.gradient(places_at(s, arc, line)[:, :2], axis=0).T[::-1]))
-    directions = _smoothed(directions, 0.6 / step)
+    directions = gaussian_filter1d(directions, 0.6 / step, mode="nearest")
     heading = np.interp(travelled + 0.5, s, directions)
-    heading = _smoothed(heading, 0.2 * _SAMPLE_HZ)
+    heading = gaussian_filter1d(heading, 0.2 * _SAMPLE_HZ, mode="nearest")
 
     floor = height(xy) if height is not None else places[:, 2] if places.shape[1] == 3 else np.zeros(len(t))
-    floor = _smoothed(floor, 0.3 * _SAMPLE_HZ)
+    floor = gaussian_filter1d(floor, 0.3 * _SAMPLE_HZ, mode="nearest")
 
     steps = 2 * np.pi * _STEP_HZ * (t + 0.3 * _wander(t, rng, (0.05, 0.1)) / _STEP_HZ)
     sideways = walker.sway * np.sin(steps / 2) + walker.wander * _wander(t, rng, (0.05, 0.2))
@@ -174,27 +176,9 @@ def walk(
     return SmoothTrajectory(t, samples, R_body_imu)
 
 
-def _rotation(angles: F64) -> F64:
-    """R = Rz(yaw) Ry(pitch) Rx(roll) of (n, 3) yaw, pitch, roll: (n, 3, 3)."""
-    (cy, cp, cr), (sy, sp, sr) = np.cos(angles).T, np.sin(angles).T
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def _smoothstep(x: F64) -> F64:
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (x * (6.0 * x - 15.0) + 10.0)
-
-
-def _smoothed(values: F64, sigma: float) -> F64:
-    """Convolved with a Gaussian whose spread is `sigma` samples; beyond the ends the values are constant."""
-    reach = round(4 * sigma)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
 
 
 def _wander(t: F64, rng: np.random.Generator, band_hz: tuple[float, float]) -> F64:
