@@ -191,7 +191,7 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
 
 def free_folder(recording: Path) -> Path:
     """The first of runs/NAME-1, runs/NAME-2, ... that does not exist yet."""
-    from app.mapping.session_file import free_path
+    from app.slam.text_files import free_path
 
     return free_path(Path("runs") / recording.resolve().stem, always_numbered=True)
 

@@ -11,7 +11,6 @@ is deterministic: the recording, the parameters by frame, the loop edits and the
 """
 
 import contextlib
-import itertools
 import json
 import logging
 import math
@@ -44,7 +43,7 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
 from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
-from app.slam.text_files import make_folder, write_texts
+from app.slam.text_files import free_path, make_folder, write_texts
 
 log = logging.getLogger(__name__)
 
@@ -216,12 +215,6 @@ class SessionWriter:
 def new_path(folder: Path, recording: Path) -> Path:
     """A name for the session file of a recording, in the order of time."""
     return free_path(folder / f"{recording.stem}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
-
-
-def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) -> Path:
-    """The first of STEM, STEM-2, STEM-3, ... that does not exist, with the suffix. always_numbered: from STEM-1 on."""
-    names = (f"-{number}" if number > 1 or always_numbered else "" for number in itertools.count(1))
-    return next(path for name in names if not (path := stem.with_name(f"{stem.name}{name}{suffix}")).exists())
 
 
 def write_session(path: Path, session: SavedSession) -> None:

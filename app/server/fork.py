@@ -18,7 +18,6 @@ from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import (
     SUFFIX,
     SavedSession,
-    free_path,
     read_session,
     recording_of,
     session_files,
@@ -29,6 +28,7 @@ from app.server.protocol import Command, CompareWith, Pause, Play, Seek, SetBrea
 from app.server.setup import Setup
 from app.server.worker import RunningEngine
 from app.slam.errors import HemislamError
+from app.slam.text_files import free_path
 
 MAIN = "main"
 FOLDER = "forks"

@@ -1,8 +1,9 @@
-"""Text files that this program writes: tables as CSV, and files that are complete or not there."""
+"""Files that this program writes: free names, tables as CSV, and texts that are complete or not there."""
 
 import contextlib
 import csv
 import io
+import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -14,6 +15,12 @@ def csv_text(*rows: Iterable[object]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) -> Path:
+    """The first of STEM, STEM-2, STEM-3, ... that does not exist, with the suffix. always_numbered: from STEM-1 on."""
+    names = (f"-{number}" if number > 1 or always_numbered else "" for number in itertools.count(1))
+    return next(path for name in names if not (path := stem.with_name(f"{stem.name}{name}{suffix}")).exists())
 
 
 def make_folder(folder: Path) -> None:

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from app.slam.errors import HemislamError
-from app.slam.text_files import csv_text, make_folder, write_texts
+from app.slam.text_files import csv_text, free_path, make_folder, write_texts
 
 
 def test_cells_with_commas_are_quoted() -> None:
@@ -30,3 +30,11 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(HemislamError, match=r"file/c cannot be made: Not a directory"):
         make_folder(tmp_path / "file" / "c")
+
+
+def test_free_names_have_the_next_number(tmp_path: Path) -> None:
+    for name in ("a.b.mcap", "a.b-2.mcap", "a.b-3.mcap"):
+        path = free_path(tmp_path / "a.b", ".mcap")
+        assert path == tmp_path / name
+        path.touch()
+    assert free_path(tmp_path / "walk", always_numbered=True) == tmp_path / "walk-1"

@@ -21,11 +21,11 @@ from typing import Any
 
 from app.child import Child, ChildDied, Link, RestartLimit
 from app.sensors.live.address import ENDED, TITLE, LiveAddress
-from app.sensors.live.recorder import further
 from app.sensors.live.source import Event, Known
 from app.sensors.live.status import LiveState
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.text_files import free_path
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ _RETRY_S = 0.5
 class LiveProcess(AbstractContextManager["LiveProcess"]):
     """Receives, and records, until `close`.
 
-    A process that dies is replaced by another one, which records into a further file (`further`).
+    A process that dies is replaced by another one, which records into a further file, `NAME-2.mcap`.
 
     Attributes:
         address: for `LiveClient`.
@@ -83,7 +83,9 @@ class LiveProcess(AbstractContextManager["LiveProcess"]):
 
     def _start(self, death: str) -> Child:
         """Start the process, after another one if there was a `death`. Raises HemislamError: it does not receive."""
-        record = further(self._record) if self._record and death else self._record
+        record = self._record
+        if record and death:
+            record = free_path(record.with_suffix(""), record.suffix)
         arguments = (self.address, *self._source, record, death, self._known)
         child = Child(_receive, *arguments, name="live", title=TITLE, fork=True)
         problem = child.receive(_START_S)

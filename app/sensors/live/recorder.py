@@ -4,7 +4,6 @@ It has a thread of its own, so that a slow disk delays nothing. Twice a second i
 a crash costs less than the last second, and a file without an end can be read (`mcap_stream.py`).
 """
 
-import itertools
 import os
 import struct
 import threading
@@ -21,12 +20,6 @@ MAX_SCANS, MAX_SAMPLES = 200, 100_000
 
 _Scan = tuple[Scan, int]
 _Imu = tuple[int, Vector, Vector, int]
-
-
-def further(path: Path) -> Path:
-    """The next free name after `path`, where a recording continues: `session-2.mcap` after `session.mcap`."""
-    names = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
-    return next(name for name in names if not name.exists())
 
 
 class Recorder:

@@ -15,7 +15,6 @@ import pytest
 
 from app.sensors.live import process as live_process
 from app.sensors.live.process import LiveClient, LiveProcess
-from app.sensors.live.recorder import further
 from app.sensors.live.source import Event
 from app.sensors.live.status import Status
 from app.sensors.recording import open_recording
@@ -183,10 +182,3 @@ def test_deaths_far_from_one_another_are_no_reason_to_give_up(tmp_path: Path, mo
             while client.state().counters.restarts < count:
                 time.sleep(0.05)
         assert process.alive
-
-
-def test_further_files_have_the_next_number_that_is_free(tmp_path: Path) -> None:
-    path = tmp_path / "a.b.mcap"
-    assert further(path) == tmp_path / "a.b-2.mcap"
-    further(path).touch()
-    assert further(path) == tmp_path / "a.b-3.mcap"
