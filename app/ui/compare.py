@@ -135,30 +135,32 @@ class ComparePanel:
         self._fork = add_button(gui, "Fork here", lambda _: self._begin(), viser.Icon.GIT_BRANCH, color=None, hint=hint)
         hint = "A kept fork or an older session, beside A."
         self._open = add_button(gui, "Open as B…", self._choose, viser.Icon.FOLDER_OPEN, hint=hint)
-        self._what = gui.add_button_group(
-            "fork", (_SWAP, _KEEP, _DISCARD), visible=False, hint="X swaps. Keep: as a file that can be opened again."
-        )
-        self._by_ground = gui.add_checkbox(
-            "ground: A against B", True, visible=False, hint="Colour the scan by who calls its points ground."
-        )
-        self._legend = gui.add_html(maths.legend(), visible=False)
-        self._numbers = gui.add_html("", visible=False)
-        a, b, both = (
-            {"stroke": colour, "width": 1.5} for colour in (css(maths.A_COLOUR), css(maths.B_COLOUR), "#b8c0cc")
-        )
-        self._plots: list[tuple[viser.GuiHtmlHandle, viser.GuiUplotHandle]] = []
+        hint = "X swaps. Keep: as a file that can be opened again."
+        self._what = gui.add_button_group("fork", (_SWAP, _KEEP, _DISCARD), visible=False, hint=hint)
+        hint = "Colour the scan by who calls its points ground."
+        self._by_ground = gui.add_checkbox("ground: A against B", True, visible=False, hint=hint)
+        self._comparison = gui.add_folder(None, visible=False)
+        with self._comparison:
+            self._add_comparison(gui)
+        self._what.on_click(by_user(self._act))
+        gui.add_command("Swap A and its fork B", hotkey="X").on_trigger(lambda _: self._swap_if_any())
+
+    def _add_comparison(self, gui: viser.GuiApi) -> None:
+        gui.add_html(maths.legend())
+        self._numbers = gui.add_html("")
+        colours = css(maths.A_COLOUR), css(maths.B_COLOUR), "#b8c0cc"
+        a, b, both = ({"stroke": colour, "width": 1.5} for colour in colours)
+        self._plots: list[tuple[viser.GuiFolderHandle, viser.GuiUplotHandle]] = []
         for title, lines in (
             ("A to B, cm", [both]),
             ("A to B, °", [both]),
             ("Frame time, ms (peaks cut)", [a, b]),
             ("Position error to truth, cm", [a, b]),
         ):
-            named = gui.add_html(heading(title), visible=False)
-            plot = chart(gui, (np.zeros(1),) * (1 + len(lines)), lines)
-            plot.visible = False
-            self._plots.append((named, plot))
-        self._what.on_click(by_user(self._act))
-        gui.add_command("Swap A and its fork B", hotkey="X").on_trigger(lambda _: self._swap_if_any())
+            titled = gui.add_folder(None, visible=False)
+            with titled:
+                gui.add_html(heading(title))
+                self._plots.append((titled, chart(gui, (np.zeros(1),) * (1 + len(lines)), lines)))
 
     def seen(self, view: View) -> View:
         """The view without the scan, while it is drawn here in other colours."""
@@ -169,8 +171,7 @@ class ComparePanel:
         b = self._forks.other
         self._sides.draw(b)
         self._fork.visible = self._open.visible = b is None
-        for control in (self._what, self._by_ground, self._legend, self._numbers):
-            control.visible = b is not None
+        self._what.visible = self._by_ground.visible = self._comparison.visible = b is not None
         if b is None:
             self._recent.clear()
         elif a.result is not None:
@@ -218,8 +219,8 @@ class ComparePanel:
         self._show_plots(_curves(found))
 
     def _show_plots(self, curves: "list[tuple[Any, ...] | None]") -> None:
-        for (title, plot), curve in zip(self._plots, curves, strict=True):
-            title.visible = plot.visible = curve is not None
+        for (titled, plot), curve in zip(self._plots, curves, strict=True):
+            titled.visible = curve is not None
             if curve is not None:
                 plot.data = curve
 

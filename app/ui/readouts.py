@@ -141,9 +141,10 @@ class ReadoutPanel:
         self._planarity = chart(gui, (*nothing, np.zeros(1)), [{"stroke": "#3ecf9a", "width": 1.5}, limit])
         gui.add_html(heading("Residual (RMS), mm"))
         self._residual = chart(gui, nothing, [{"stroke": "#40b8f0", "width": 1.5}])
-        self._error_title = gui.add_html(heading("Position error to truth, cm"), visible=False)
-        self._error = chart(gui, nothing, [{"stroke": "#ff5c8d", "width": 1.5}])
-        self._error.visible = False
+        self._of_truth = gui.add_folder(None, visible=False)
+        with self._of_truth:
+            gui.add_html(heading("Position error to truth, cm"))
+            self._error = chart(gui, nothing, [{"stroke": "#ff5c8d", "width": 1.5}])
 
     def draw(self, snapshot: Snapshot) -> None:
         dropped = snapshot.transport.dropped
@@ -169,5 +170,5 @@ class ReadoutPanel:
         stamps, residual = plotted(series, "residual_rms", worst="residual_rms" if whole else "")
         self._residual.data = (stamps, 1000 * residual)
         stamps, error = plotted(series, "error_m", worst="error_m" if whole else "")
-        self._error.visible = self._error_title.visible = bool(np.isfinite(error).any() and len(error) > 1)
+        self._of_truth.visible = bool(np.isfinite(error).any() and len(error) > 1)
         self._error.data = (stamps, 100 * error)

@@ -144,7 +144,7 @@ SCAN, PATH = "/map/compare_lidar/scan", "/map/compare_path/0"
 def test_without_a_fork_the_page_says_what_one_is_for(page: Page, wire: Wire) -> None:
     assert "Fork here" in page.panel._status.content and page.panel._fork.visible
     assert not page.panel._what.visible and not page.sides._choice.visible
-    assert not any(chart.visible for _, chart in page.panel._plots)
+    assert not any(titled.visible for titled, _ in page.panel._plots)
     page.draw()
     wire.clear()
     page.draw()
@@ -195,7 +195,7 @@ def test_the_drift_and_the_turn_are_reported_and_plotted_over_time(page: Page) -
     np.testing.assert_allclose(apart[0], 0.1 * np.arange(20, 61), atol=1e-9)
     np.testing.assert_allclose(apart[1], 100 * DRIFT_M * np.arange(41), atol=1e-9)
     np.testing.assert_allclose(turned[1], [0.0] + [TURN_DEG] * 40, atol=1e-6)
-    assert all(chart.visible for _, chart in page.panel._plots)
+    assert all(titled.visible for titled, _ in page.panel._plots)
 
 
 def test_b_s_trajectory_is_blue_from_the_fork_on(page: Page, wire: Wire, server: viser.ViserServer) -> None:

@@ -115,38 +115,24 @@ class Inspector:
         )
         self._go.on_click(by_user(act))
         self._waiting = gui.add_html(panel("quiet", "Waiting for the submaps …"))
-        self._share = gui.add_slider(
-            "graph to fit",
-            0.0,
-            1.0,
-            0.01,
-            1.0,
-            hint="Left: where the graph had the submaps. Right: as they were registered.",
-        )
+        hint = "Left: where the graph had the submaps. Right: as they were registered."
+        self._share = gui.add_slider("graph to fit", 0.0, 1.0, 0.01, 1.0, hint=hint)
         self._alone = gui.add_checkbox(
             "hide the map", True, hint="Show the two submaps alone, without the map and the scan."
         )
+        self._details = gui.add_folder(None)
+        with self._details:
+            self._add_details(gui)
+
+    def _add_details(self, gui: viser.GuiApi) -> None:
         self._legend = gui.add_html("")
-        self._contexts_title = gui.add_html(
-            heading("Heights around both keyframes from above, the newer turned to match; grey: never seen")
-        )
+        gui.add_html(heading("Heights around both keyframes from above, the newer turned to match; grey: never seen"))
         self._contexts = gui.add_image(_NO_CONTEXTS, format="png")
         self._shifts_title = gui.add_html("")
         line, limit = {"stroke": "#40b8f0", "width": 1.5}, {"stroke": "#e08a00", "width": 1.5, "dash": [3, 3]}
         self._shifts = chart(gui, (np.zeros(1),) * 3, [line, limit])
-        self._residuals_title = gui.add_html(heading("Points over their distance to the other submap's surface, mm"))
+        gui.add_html(heading("Points over their distance to the other submap's surface, mm"))
         self._residuals = chart(gui, (np.zeros(1),) * 3, [line | {"fill": "#40b8f080"}, limit])
-        self._detailed = (
-            self._share,
-            self._alone,
-            self._legend,
-            self._contexts_title,
-            self._contexts,
-            self._shifts_title,
-            self._shifts,
-            self._residuals_title,
-            self._residuals,
-        )
 
     def show_map(self) -> None:
         """Show what became of the map in place of the submaps, until another loop is chosen or `alone` is."""
@@ -174,8 +160,7 @@ class Inspector:
         detail = _detail(snapshot, edge.pair if edge is not None else None)
         if not self._changes(detail, edge, snapshot.params.loops):
             return
-        for handle in self._detailed:
-            handle.visible = detail is not None
+        self._share.visible = self._alone.visible = self._details.visible = detail is not None
         self._waiting.visible = detail is None
         if edge is None:
             return
