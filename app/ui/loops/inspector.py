@@ -14,10 +14,10 @@ from app.slam.loops.scan_context import YAWS
 from app.slam.loops.types import LoopDetail, LoopEdge, Pair
 from app.slam.sections import LoopsParams
 from app.slam.types import F32, F64, NON_GROUND, U8
-from app.ui.colours import TABLES
+from app.ui.colours import TABLES, Rgb
 from app.ui.html import heading, panel
 from app.ui.loops.words import NEWER, OLDER, evidence
-from app.ui.nodes import add_exact_points, place
+from app.ui.nodes import add_exact_points, clear, place
 from app.ui.widgets import ROOT, Changes, Page, View, by_user, chart, show
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
@@ -60,39 +60,24 @@ class Overlay:
     """The two clouds as nodes below `root`; their points are sent once, a moved slider sends a pose."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
-        self._scene = scene
-        self._root = root
-        self._nodes: dict[str, viser.PointCloudHandle] = {}
-        self._points: dict[str, F32] = {}
+        self._scene, self._root = scene, root
+        self._nodes: list[viser.PointCloudHandle] = []
+        self._changes = Changes()
 
     def draw(self, pairing: Pairing | None, T_map_newer: F64 | None, point_size: float) -> None:
         """Show the clouds with the newer one's frame at `T_map_newer` (4, 4); None removes them."""
-        if pairing is None or T_map_newer is None:
-            self._remove(*self._nodes)
-            self._points.clear()
-            return
-        for name, points, colour, T in (
-            ("older", pairing.older, OLDER, pairing.T_map_older),
-            ("newer", pairing.newer, NEWER, T_map_newer),
-        ):
-            if points is not self._points.get(name):
-                self._points[name] = points
-                self._send(name, points, colour, point_size)
-            if (node := self._nodes.get(name)) is not None:
-                place(node, T)
-                node.point_size = point_size
-
-    def _remove(self, *names: str) -> None:
-        for name in names:
-            if (node := self._nodes.pop(name, None)) is not None:
-                node.remove()
-
-    def _send(self, name: str, points: F32, colour: tuple[int, int, int], point_size: float) -> None:
-        if not len(points):  # the page cannot draw a cloud without points
-            self._remove(name)
-            return
-        node = f"{self._root}/{name}"
-        self._nodes[name] = add_exact_points(self._scene, node, points[:MOST_POINTS], colour, point_size)
+        clouds: list[tuple[str, F32, Rgb, F64]] = []
+        if pairing is not None and T_map_newer is not None:
+            both = ("older", pairing.older, OLDER, pairing.T_map_older), ("newer", pairing.newer, NEWER, T_map_newer)
+            clouds = [cloud for cloud in both if len(cloud[1])]  # the page cannot draw a cloud without points
+        if self._changes(*(points for _, points, *_ in clouds)):
+            clear(self._nodes)
+            for name, points, colour, _ in clouds:
+                node, some = f"{self._root}/{name}", points[:MOST_POINTS]
+                self._nodes.append(add_exact_points(self._scene, node, some, colour, point_size))
+        for cloud, (*_, T) in zip(self._nodes, clouds, strict=True):
+            place(cloud, T)
+            cloud.point_size = point_size
 
 
 class Inspector:
