@@ -90,7 +90,7 @@ def _clicks(rng: np.random.Generator) -> list[float]:
                 heard, begin = len(page.heard), time.monotonic()
                 client = SimpleNamespace(camera=SimpleNamespace(fov=1.0))
                 event: Any = SimpleNamespace(client=client, ray_origin=tuple(EYE), ray_direction=tuple(aim))
-                workbench._measure._clicked(event)
+                workbench._measure.clicked(event)
                 found.append(_label(page, heard, number) - begin)
         workbench.close()
     server.stop()

@@ -1,6 +1,5 @@
 """The brush: marks points of the present frame as ground or not, which `ground-f1` then measures labels against."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,15 +29,11 @@ _SCALE: Final = 2.0
 
 
 class BrushPanel:
-    """Widgets in the caller's container, and the marked points of the present frame in the scene.
+    """Widgets in the caller's container, and the marked points of the present frame in the scene."""
 
-    Args:
-        taken: whether a click in the scene was meant for something else.
-    """
-
-    def __init__(self, page: Page, taken: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, page: Page) -> None:
         gui = page.gui
-        self._page, self._taken = page, taken
+        self._page = page
         self._changes = Changes()
         self._mark: int | None = None
         self._nodes: list[viser.SceneNodeHandle] = []
@@ -58,7 +53,6 @@ class BrushPanel:
         self._load = gui.add_upload_button("Load labels", icon=viser.Icon.UPLOAD, color="gray", mime_type=".json")
         brush.on_click(by_user(lambda name, _: self.choose(name)))
         self._load.on_upload(by_user(self._read))
-        page.scene.on_click()(self._click)
         page.scene.on_rect_select(modifier="shift")(self._drag)
 
     @property
@@ -108,15 +102,17 @@ class BrushPanel:
         snapshot = self._page.snapshot()
         return None if snapshot.transport.playing or not self.painting else snapshot.result
 
-    def _click(self, event: viser.SceneClickEvent) -> None:
-        result, ray = self._frame(), self._page.in_map(event)
-        if result is None or self._taken():
-            return
+    def clicked(self, event: viser.SceneClickEvent) -> bool:
+        """Take a click in the scene, while the brush is on; whether it was taken."""
+        if (result := self._frame()) is None:
+            return self.painting
+        ray = self._page.in_map(event)
         T = lie.inverse(result.T_map_imu @ result.state.T_imu_lidar)
         points = result.cloud.points
         index = nearest_to_ray(points, lie.moved(T, ray[0]), T[:3, :3] @ ray[1])
         if index is not None:
             self._paint(result, np.linalg.norm(points - points[index], axis=1) <= self._radius.value)
+        return True
 
     def _drag(self, event: viser.SceneRectSelectEvent) -> None:
         if (result := self._frame()) is not None:

@@ -56,7 +56,6 @@ class MeasurePanel:
             "snap to corners", False, hint="A click near a corner means where the surfaces around meet; else an edge."
         )
         self._save = add_button(gui, "Download as CSV", self._download, viser.Icon.DOWNLOAD, visible=False)
-        page.scene.on_click()(self._clicked)
 
     @property
     def picking(self) -> bool:
@@ -147,9 +146,12 @@ class MeasurePanel:
         self._list.content = self._bridge.live(panel("measures", rows, waiting)) if rows or later else ""
         self._list.visible, self._save.visible = bool(rows or later), bool(rows)
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        if self.picking and event.client is not None:
-            self._click = (*self._page.in_map(event), _WIDTH * event.client.camera.fov)
+    def clicked(self, event: viser.SceneClickEvent) -> bool:
+        """Take a click in the scene, while one is measured; whether it was taken. `draw` uses it."""
+        if not self.picking:
+            return False
+        self._click = (*self._page.in_map(event), _WIDTH * event.client.camera.fov)
+        return True
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
         """What the list sends: "delete 3 door", the place and the name in the list as that browser shows it."""

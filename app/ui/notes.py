@@ -1,6 +1,5 @@
 """Notes: a field for a new one, their list, and pins in the scene where the sensor was when they were taken."""
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -27,13 +26,10 @@ _LETTER_PX: Final = 6.0
 
 
 class NotesPanel:
-    """A field for a note on the present frame, the notes made so far, and their pins.
+    """A field for a note on the present frame, the notes made so far, and their pins."""
 
-    taken: whether a click in the scene was meant for something else than pins.
-    """
-
-    def __init__(self, page: Page, taken: Callable[[], bool] = lambda: False) -> None:
-        self._page, self._taken = page, taken
+    def __init__(self, page: Page) -> None:
+        self._page = page
         self._changes = Changes()
         self._nodes: list[viser.SceneNodeHandle] = []
         self._pinned: list[tuple[int, str]] = []  # frame and text
@@ -42,7 +38,6 @@ class NotesPanel:
         self._text = page.gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
         self._add = add_button(page.gui, "Add note", lambda _: self._note(), viser.Icon.NOTE)
         self._list = page.gui.add_html("", visible=False)
-        page.scene.on_click()(self._clicked)
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
         self._draw_pins(snapshot, view)
@@ -92,9 +87,9 @@ class NotesPanel:
         for (frame, text), position in zip(pinned, where, strict=True):
             self._nodes.append(scene.add_label(f"{root}/{frame}", text, position=position, anchor="center-left"))
 
-    def pin_at(self, event: viser.SceneClickEvent) -> int | None:
+    def _pin_at(self, event: viser.SceneClickEvent) -> int | None:
         """The frame of the pin that was clicked."""
-        if not self._pinned or self._taken():
+        if not self._pinned:
             return None
         camera = event.client.camera
         pixels = np.array([camera.image_width, camera.image_height])
@@ -103,9 +98,11 @@ class NotesPanel:
         hit = np.flatnonzero((np.abs(y) <= _REACH_PX) & (x >= -_REACH_PX) & (x <= width))
         return self._pinned[int(hit[np.hypot(x, y)[hit].argmin()])][0] if len(hit) else None
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        if (frame := self.pin_at(event)) is not None:
+    def clicked(self, event: viser.SceneClickEvent) -> bool:
+        """Go to the frame of the pin that was clicked in the scene; whether one was."""
+        if (frame := self._pin_at(event)) is not None:
             self._page.send(Seek(frame))
+        return frame is not None
 
 
 def pins(notes: tuple[Note, ...], frames: int) -> list[tuple[int, str]]:

@@ -1,6 +1,5 @@
 """Study of a single frame: colours by number, the ground threshold, one point and its planes, files."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
@@ -93,17 +92,13 @@ class StudyScene:
 
 
 class StudyPanel:
-    """Widgets in the caller's container, and what they show in the scene.
+    """Widgets in the caller's container, and what they show in the scene."""
 
-    Args:
-        taken: whether a click was meant for something else.
-    """
-
-    def __init__(self, page: Page, taken: Callable[[viser.SceneClickEvent], bool] = lambda _: False) -> None:
+    def __init__(self, page: Page) -> None:
         gui = page.gui
-        self._page, self._taken = page, taken
+        self._page = page
         self._scene = StudyScene(page.scene)
-        self._clicked: tuple[F64, F64] | None = None  # the newest click's ray, in the map
+        self._click: tuple[F64, F64] | None = None  # the newest click's ray, in the map
         self._picked: Picked | None = None
         self._of: StepResult | None = None  # the frame of the picked point
         self._scene_changes = Changes(page.now, SCENE_PERIOD_S)
@@ -127,7 +122,6 @@ class StudyPanel:
         gui.add_command("Next colour mode of the frame under study", hotkey="V").on_trigger(
             lambda _: choose_next(self._by)
         )
-        page.scene.on_click()(self._click)
 
     def seen(self, view: View) -> View:
         """The view without what stands in the way of the study."""
@@ -145,7 +139,7 @@ class StudyPanel:
 
     def _draw_point(self, snapshot: Snapshot, view: View) -> None:
         result, sigma, count = snapshot.result, snapshot.params.ground.sigma, int(self._neighbours.value)
-        clicked, self._clicked = self._clicked, None
+        clicked, self._click = self._click, None
         before, self._of = self._of, result
         index = self._picked.index if self._picked is not None else None
         if result is None or before is None or result.cloud.points is not before.cloud.points:
@@ -177,9 +171,10 @@ class StudyPanel:
             colours = (LABEL_COLOURS[1], LABEL_COLOURS[0], _THRESHOLD)
             self._summary.content = panel("curve", drawn.points_under, drawn.points_over, colours, why)
 
-    def _click(self, event: viser.SceneClickEvent) -> None:
-        if not self._taken(event):
-            self._clicked = self._page.in_map(event)
+    def clicked(self, event: viser.SceneClickEvent) -> bool:
+        """Take any click in the scene; `draw` looks which point of the frame it means."""
+        self._click = self._page.in_map(event)
+        return True
 
     def _download(self, kind: Any, client: viser.ClientHandle) -> None:
         snapshot = self._page.snapshot()

@@ -113,14 +113,11 @@ class Workbench:
             with gui.add_folder("Pause when", expand_by_default=False):
                 self._breakpoints = BreakpointPanel(page)
         with tabs.add_tab("Loops", viser.Icon.INFINITY):
-            self._loops = LoopsPanel(page, self._look_freely, taken=lambda click: self._picks(click))
+            self._loops = LoopsPanel(page, self._look_freely)
         with tabs.add_tab("Study", viser.Icon.MICROSCOPE):
-            self._study = StudyPanel(
-                page,
-                taken=lambda click: self._picks(click) or self._brush.painting or self._loops.points_at(click),
-            )
+            self._study = StudyPanel(page)
             with gui.add_folder("Label by hand", expand_by_default=False):
-                self._brush = BrushPanel(page, taken=lambda: self._measure.picking)
+                self._brush = BrushPanel(page)
         with tabs.add_tab("A/B", viser.Icon.GIT_COMPARE):
             self._compare = ComparePanel(page, forks, self._sides)
         with tabs.add_tab("Auto-tune", viser.Icon.TARGET_ARROW):
@@ -147,7 +144,7 @@ class Workbench:
             with gui.add_folder("Georeference", expand_by_default=False):
                 self._georeference = GeoreferencePanel(page, folders, self._measure)
             with gui.add_folder("Notes"):
-                self._notes = NotesPanel(page, taken=lambda: self._measure.picking or self._brush.painting)
+                self._notes = NotesPanel(page)
             self._notices = NoticePanel(server)
         with tabs.add_tab("Help", viser.Icon.HELP):
             gui.add_html(render("help.html"))
@@ -157,6 +154,7 @@ class Workbench:
             self._readouts, self._doctor, self._calibration, self._live, files, self._camera,
             self._tune, self._georeference, self._clip, self._map_compare, self._pictures, scale,
         )  # fmt: skip
+        server.scene.on_click()(self.clicked)
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
         self._tuned_at = -_TUNING_S
@@ -210,8 +208,11 @@ class Workbench:
         dimmed = [(DIMMED[view.light], "map, while ground sliders move")] if view.tuning and view.map else []
         return [*self._loops.keys(current, view.light), *path, *dimmed]
 
-    def _picks(self, click: viser.SceneClickEvent) -> bool:
-        return self._measure.picking or self._notes.pin_at(click) is not None
+    def clicked(self, event: viser.SceneClickEvent) -> None:
+        """A click in the scene is for the first panel that takes it."""
+        for one in (self._measure, self._brush, self._notes, self._loops, self._study):
+            if one.clicked(event):
+                return
 
     def _look_freely(self, client: viser.ClientHandle) -> None:
         """A browser's camera is sent somewhere else and is to stay there."""

@@ -49,7 +49,7 @@ class Painting:
         event = SimpleNamespace(
             ray_origin=tuple(at + np.array([0.0, 0.0, 5.0])), ray_direction=(0.0, 0.0, -1.0), client=None
         )
-        self.panel._click(event)  # type: ignore[arg-type]
+        self.panel.clicked(event)  # type: ignore[arg-type]
 
 
 @pytest.fixture

@@ -115,7 +115,7 @@ class Bench:
         direction = tuple(np.array([x, y, 0.8]) - UP_AT_10)
         client = SimpleNamespace(camera=SimpleNamespace(fov=1.0))
         event = SimpleNamespace(client=client, ray_origin=tuple(UP_AT_10), ray_direction=direction)
-        self.panel._clicked(event)  # type: ignore[arg-type]
+        self.panel.clicked(event)  # type: ignore[arg-type]
         self.panel.draw(self.now, View())
 
     def keep(self) -> None:

@@ -179,7 +179,7 @@ class Bench:
         point = T[:3, :3] @ result.cloud.points[index] + T[:3, 3] + self.offset
         camera = T[:3, 3] + self.offset + [0, 0, 1.0]
         event: Any = viser.SceneClickEvent(SOMEONE, 0, tuple(camera), tuple(point - camera), (0.5, 0.5), None)  # type: ignore[arg-type]
-        self.panel._click(event)
+        self.panel.clicked(event)
 
     @property
     def nodes(self) -> set[str]:

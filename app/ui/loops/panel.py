@@ -41,20 +41,13 @@ class LoopsPanel:
 
     Args:
         look_freely: stops following the sensor, so that a camera can stay where it is put.
-        taken: whether clicks in the scene are meant for something else.
 
     Attributes:
         chosen: the loop that is looked at.
     """
 
-    def __init__(
-        self,
-        page: Page,
-        look_freely: Callable[[viser.ClientHandle], None],
-        taken: Callable[[viser.SceneClickEvent], bool] = lambda _: False,
-    ) -> None:
+    def __init__(self, page: Page, look_freely: Callable[[viser.ClientHandle], None]) -> None:
         gui = page.gui
-        self._taken = taken
         self._page, self._look_freely = page, look_freely
         self.chosen: Pair | None = None
         self._coming: Pair | None = None
@@ -97,7 +90,6 @@ class LoopsPanel:
             self._factors = gui.add_html("")
         gui.add_command("Next loop of the table", hotkey="J").on_trigger(lambda _: self._step(1))
         gui.add_command("Previous loop of the table", hotkey="K").on_trigger(lambda _: self._step(-1))
-        page.scene.on_click()(self._clicked)
 
     def seen(self, view: View) -> View:
         """The view, without the map and the scan while two submaps are shown alone."""
@@ -115,10 +107,6 @@ class LoopsPanel:
         if not self._inspector.shown:
             return arches
         return [(OLDER, f"keyframe {chosen[0]}"), (NEWER, f"keyframe {chosen[1]}"), *arches]
-
-    def points_at(self, event: viser.SceneClickEvent) -> bool:
-        """Whether a click is for the loops: at an arch, or while keyframes are picked."""
-        return self._add_loop.picking or self._edges.pick(*self._page.in_map(event)) is not None
 
     def choose(self, pair: Pair | None) -> None:
         """Show everything about a loop; None: about none."""
@@ -206,17 +194,19 @@ class LoopsPanel:
                 if text in named:
                     self.choose(None if named[text] == self.chosen else named[text])
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        origin, direction = self._page.in_map(event)
-        if self._taken(event):
-            return
+    def clicked(self, event: viser.SceneClickEvent) -> bool:
+        """Take a click in the scene at an arch, or while keyframes are picked; whether it was taken."""
+        ray = self._page.in_map(event)
         if self._add_loop.picking:
-            self._add_loop.pick(origin, direction)
-        elif (pair := self._edges.pick(origin, direction)) is not None:
-            self.choose(pair)
-            if self._opener is not None:
-                self._opener.remove()
-            self._opener = event.client.gui.add_html(panel("open_tab", "Loops"))
+            self._add_loop.pick(*ray)
+            return True
+        if (pair := self._edges.pick(*ray)) is None:
+            return False
+        self.choose(pair)
+        if self._opener is not None:
+            self._opener.remove()
+        self._opener = event.client.gui.add_html(panel("open_tab", "Loops"))
+        return True
 
     def _step(self, by: int) -> None:
         rows = [edge.pair for edge in listed(self._page.snapshot().loops.edges, self._shown, self._order)]

@@ -42,10 +42,9 @@ class Page:
         return self.server.scene._handle_from_node_name.get(name)
 
     def click_scene(self, origin: np.ndarray, towards: np.ndarray) -> None:
-        event: Any = SimpleNamespace(
-            client=self.server, ray_origin=tuple(origin), ray_direction=tuple(towards - origin)
-        )
-        self.loops._clicked(event)
+        client = SimpleNamespace(gui=self.server.gui, camera=SimpleNamespace(fov=1.0))
+        event: Any = SimpleNamespace(client=client, ray_origin=tuple(origin), ray_direction=tuple(towards - origin))
+        self.workbench.clicked(event)
 
     def says(self, *html: str) -> bool:
         return all(part in self.loops._table.content for part in html)

@@ -1,10 +1,9 @@
 """Loops in the scene: which arches are drawn, where, and which of them a click means."""
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
+import pytest
 
 from app.server.protocol import InspectLoop, LoopsView
 from app.slam.loops.types import Verdict
@@ -77,10 +76,28 @@ def test_a_click_at_an_arch_is_not_taken_for_a_point_of_the_scan(page: Page) -> 
         (middle + np.array([2.0, -6.0, 9.0]), middle, False),
         (np.array([12.0, 7.0, 50.0]), np.array([12.0, 7.0, 0.0]), True),
     ):
-        page.workbench._study._clicked = None
-        event: Any = SimpleNamespace(ray_origin=tuple(eye), ray_direction=tuple(target - eye))
-        page.workbench._study._click(event)
-        assert (page.workbench._study._clicked is not None) is meant
+        page.workbench._study._click = None
+        page.click_scene(eye, target)
+        assert (page.workbench._study._click is not None) is meant
+
+
+def test_a_click_while_measuring_or_painting_is_neither_for_loops_nor_for_pins(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr(page.workbench._notes, "clicked", asked.append)
+    middle = page.engine.snapshot.keyframe_poses[list(GOOD), :3, 3].mean(axis=0) + np.array([0.0, 0.0, 1.1])
+    eye = middle + np.array([2.0, -6.0, 9.0])
+    page.workbench._measure.begin("point")
+    page.click_scene(eye, middle)
+    assert page.workbench._measure._click is not None
+    page.workbench._measure.begin("stop")
+    page.workbench._brush.choose("ground")
+    page.click_scene(eye, middle)
+    assert page.loops.chosen is None and page.workbench._study._click is None and not asked
+    page.workbench._brush.choose("off")
+    page.click_scene(eye, middle)
+    assert page.loops.chosen == GOOD and len(asked) == 1
 
 
 def test_a_click_beside_all_loops_and_one_on_what_is_hidden_choose_nothing(page: Page) -> None:
