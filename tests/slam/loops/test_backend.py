@@ -71,7 +71,7 @@ def test_every_candidate_says_why(walked: Walked) -> None:
 
 
 def test_corridors_and_rooms_that_repeat_make_no_false_loop() -> None:
-    walk = take("identical", 160.0)
+    walk = take("identical", 140.0)
     backend = drive(walk.drifted(0.01, 0.02), PARAMS)
     errors = np.array([error(edge, walk.truth) for edge in accepted(backend)])
     assert len(errors) > 20, "true revisits are found all the same"
@@ -80,7 +80,7 @@ def test_corridors_and_rooms_that_repeat_make_no_false_loop() -> None:
 
 
 def test_flats_that_look_alike_stay_beside_one_another_even_if_odometry_drifts_more_than_it_may() -> None:
-    walk = take("flats", 185.0)
+    walk = take("flats", 160.0)
     backend = drive(walk.drifted(0.05, -0.1), PARAMS)
     errors = np.array([error(edge, walk.truth) for edge in accepted(backend)])
     assert len(errors) > 50, "true revisits are found all the same"
@@ -89,7 +89,7 @@ def test_flats_that_look_alike_stay_beside_one_another_even_if_odometry_drifts_m
 
 
 def test_storeys_that_look_alike_stay_above_one_another() -> None:
-    walk = take("storeys", 155.0)
+    walk = take("storeys", 120.0)
     backend = drive(walk.drifted(0.01, 0.02), PARAMS)
     loops = accepted(backend)
     errors = np.array([error(edge, walk.truth) for edge in loops])
