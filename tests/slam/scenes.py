@@ -8,6 +8,7 @@ sensor's pose at that time.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,21 +48,29 @@ class Scene:
         """Ranges (n,), inf where nothing is hit, and whether floor was hit (n,)."""
         ranges, floor = np.full(len(origins), np.inf), np.zeros(len(origins), dtype=bool)
         with np.errstate(divide="ignore", invalid="ignore"):
+            rays = [*zip(origins.T.copy(), directions.T.copy(), strict=True)]
             if self.room is not None:
-                exits = np.maximum((self.room[0] - origins) / directions, (self.room[1] - origins) / directions)
-                ranges = exits.min(axis=1)
-                floor = (exits.argmin(axis=1) == 2) & (directions[:, 2] < 0)
+                x, y, z = (np.maximum(*sides) for sides in _crossed(self.room, rays))
+                ranges = np.minimum(np.minimum(x, y), z)
+                floor = (z < np.minimum(x, y)) & (directions[:, 2] < 0)
             if self.ground is not None:
                 normal, distance = self.ground
                 t = (distance - origins @ normal) / (directions @ normal)
                 nearer = (t > 0) & (t < ranges)
                 ranges, floor = np.where(nearer, t, ranges), floor | nearer
-            for low, high in self.boxes:
-                a, b = (low - origins) / directions, (high - origins) / directions
-                enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+            for corners in self.boxes:
+                enters, leaves = zip(
+                    *((np.minimum(*sides), np.maximum(*sides)) for sides in _crossed(corners, rays)), strict=True
+                )
+                enter, leave = reduce(np.maximum, enters), reduce(np.minimum, leaves)
                 nearer = (enter > 0) & (enter < leave) & (enter < ranges)
                 ranges, floor = np.where(nearer, enter, ranges), floor & ~nearer
         return ranges, floor
+
+
+def _crossed(corners: np.ndarray, rays: list[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each axis: where along the rays its two sides are. Axis by axis, since rows of three are slow to compare."""
+    return [((low - o) / d, (high - o) / d) for low, high, (o, d) in zip(*corners, rays, strict=True)]
 
 
 def box(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float) -> np.ndarray:
