@@ -93,7 +93,7 @@ class Recordings:
             self._mid360(),
             self._sent(self._path / "airy.mcap", AIRY),
         ]
-        self._files = {kind: self._written(kind, self._entries).read_bytes() for kind in sorted({*FORMATS})}
+        self._files: dict[str, bytes] = {}
         code, said, _, _ = self._run(self.good)
         assert code == 0, said
         self.said = {*SAYS_SO.findall(said)}
@@ -155,7 +155,7 @@ class Recordings:
     def _damaged(self, luck: random.Random) -> tuple[Path, str]:
         kind = luck.choice(FORMATS)
         if kind in ONLY_BYTES or luck.random() < 0.5:
-            data = bytes_damaged(luck, self._files[kind])
+            data = bytes_damaged(luck, self._file(kind))
             path = self._path / f"case.{kind.partition('-')[0]}"
             path.write_bytes(data)
             return self._with_params(path), f"bytes of {kind}"
@@ -167,6 +167,12 @@ class Recordings:
         path = self._written(kind, entries, luck_of_schema)
         names = ", ".join(damage.__name__ for damage in chosen) + (" and schema" if luck_of_schema else "")
         return self._with_params(path), f"{names} of {kind}"
+
+    def _file(self, kind: str) -> bytes:
+        """The undamaged walk in a format, written when it is first wanted: all of them take seconds."""
+        if kind not in self._files:
+            self._files[kind] = self._written(kind, self._entries).read_bytes()
+        return self._files[kind]
 
     def _with_params(self, path: Path) -> Path:
         path.with_name(f"{path.stem}.params.yaml").write_text(self._params, encoding="utf-8")
