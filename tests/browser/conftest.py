@@ -97,7 +97,8 @@ class Bench:
 
         def there() -> bool:
             client.camera.position, client.camera.look_at = position, look_at
-            self.page.wait_for_timeout(1000)
+            put = client.camera.update_timestamp
+            self.within(1.0, lambda: client.camera.update_timestamp > put)  # the page says that it moved it
             return bool(np.allclose(self.resting_camera(client), position, atol=1e-3))
 
         self.eventually(there)

@@ -105,8 +105,9 @@ def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled
 
 
 def test_two_drags_of_a_slider_are_two_steps_of_undo(bench: Bench) -> None:
+    """Each is over when the page has said that the slider was let go."""
     page, slider = bench.page, bench.page.locator(SLIDERS).nth(ALPHA)
-    values = [bench.engine.snapshot.params.ground.alpha]
+    values, history = [bench.engine.snapshot.params.ground.alpha], bench.workbench._parameters._history
     for _ in range(2):
         box = slider.bounding_box()
         assert box is not None
@@ -116,7 +117,7 @@ def test_two_drags_of_a_slider_are_two_steps_of_undo(bench: Bench) -> None:
         page.mouse.move(x + 15, y, steps=3)
         page.mouse.up()
         bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha > values[-1] + 1)
-        page.wait_for_timeout(2000)
+        bench.eventually(lambda: history._states[-1] == bench.engine.snapshot.params and history._changed_at < 0)
         values.append(bench.engine.snapshot.params.ground.alpha)
     for value in (values[1], values[0]):
         page.get_by_role("button", name="Undo α seed angle").click()
