@@ -36,7 +36,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
     parts = {name: folder / f".{name}.part" for name in texts}
     try:
         for name, part in parts.items():
-            part.write_text(texts[name], encoding="utf-8", errors="backslashreplace")  # a path may be no UTF-8
+            part.write_text(texts[name], encoding="utf-8", errors="backslashreplace")  # a path need not be UTF-8
         for name, part in parts.items():
             part.replace(folder / name)
     except OSError as error:

@@ -74,9 +74,9 @@ def settle(
         stretch = float(np.ptp(walked[[edge.newer, *agreeing]]))
         needed = params.support * (OUTVOTING if alone else 1)
         evidence = replace(edge.evidence, support=support)
-        rivals = _rivals(edge, alive, walked, poses, drift) if alone else []
-        may_count = not alone or (stretch >= STRETCH_M and not rivals)
-        if support >= needed and support > 2 * against and may_count:
+        rivals = _rivals(edge, alive, walked, poses, drift) if alone else 0
+        likely = not alone or (stretch >= STRETCH_M and not rivals)
+        if likely and support >= needed and support > 2 * against:
             outvoted = f"; together they outvote odometry ({stretch:.0f} m)" if alone else ""
             reason = f"{evidence.summary}; {support} others agree{outvoted}"
             out[edge.pair] = replace(
@@ -88,7 +88,7 @@ def settle(
                 waits = f"{edge.evidence.against_odometry(params.max_mahalanobis)}; {support} of {needed} others agree"
                 waits += f" over {stretch:.0f} m (least {STRETCH_M:g} m)"
             if rivals:
-                waits += f"; {len(rivals)} that odometry finds likelier tie it elsewhere"
+                waits += f"; {rivals} that odometry finds likelier lead to another place"
             contradicted = f", {against} contradict it" if against else ""
             named = tuple(contradicting[:NAMED])
             out[edge.pair] = replace(
@@ -109,16 +109,16 @@ def _agree(edge: LoopEdge, others: Sequence[LoopEdge], poses: F64, ways: F64, dr
     return _off(edge, T, covariances + np.eye(6) * walked[:, None, :] ** 2) < AGREE
 
 
-def _rivals(edge: LoopEdge, alive: Sequence[LoopEdge], walked: F64, poses: F64, drift: Drift) -> list[Pair]:
-    """Loops that tie keyframes nearby to another place across more odometry, which they deviate from less."""
+def _rivals(edge: LoopEdge, alive: Sequence[LoopEdge], walked: F64, poses: F64, drift: Drift) -> int:
+    """Number of loops from about the same place that lead elsewhere, span more odometry and deviate from it by less."""
     less = [o for o in alive if not o.evidence.ambiguous and o.evidence.mahalanobis < edge.evidence.mahalanobis]
     older, newer = (_ends(less, walked) - walked[[*edge.pair]]).T
     chosen = np.flatnonzero((older < -NEIGHBOURHOOD_M) & (np.abs(newer) < NEIGHBOURHOOD_M))
     if not len(chosen):
-        return []
+        return 0
     others = [less[index] for index in chosen]
     agree = _agree(edge, others, poses, np.abs(older[chosen]) + np.abs(newer[chosen]), drift)
-    return [other.pair for other, yes in zip(others, agree, strict=True) if not yes]
+    return int(np.count_nonzero(~agree))
 
 
 def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
