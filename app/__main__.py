@@ -130,7 +130,8 @@ def info(
     for finding in findings:
         typer.echo(f"{finding.verdict:<9}  {finding.subject:<{width}}  {finding.text}")
         if finding.option:
-            typer.echo(f"{'':<9}  {'':<{width}}  -> {finding.option}")
+            use = "->" if finding.verdict == "needs you" else "if that is wrong:"
+            typer.echo(f"{'':<9}  {'':<{width}}  {use} {finding.option}")
     if calibrate and is_mounting_unknown(params) and (advised := look_for_mounting(recording, params)):
         typer.echo(advised)
     waiting = sum(finding.verdict == "needs you" for finding in findings)

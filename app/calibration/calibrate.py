@@ -15,6 +15,7 @@ from app.calibration.lines import Lines, fit_lines
 from app.calibration.odometry import track
 from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
 from app.calibration.translation import Moved, fit_translation
+from app.sensors.presets import built_in_mounting
 from app.sensors.recording import open_recording
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -48,6 +49,7 @@ class Calibration:
 
     Attributes:
         recording: the file. params: what was taken so far. lasted_s: the part that was used.
+        preset: from which the mounting in `params` is, as none was given; "" if it was.
         turned, moved: the fits. down: (3,) unit direction of gravity in the LiDAR frame at the begin.
         residuals: m, RMS of the scans to the map without the IMU, and with it.
         gyro_noise, accel_noise: of the IMU in most seconds, vibrations included.
@@ -56,6 +58,7 @@ class Calibration:
 
     recording: Path
     params: Params
+    preset: str
     lasted_s: float
     turned: Turned
     moved: Moved
@@ -119,11 +122,12 @@ class Calibration:
             values["recording.imu_time_offset"] = round(late, 4)
         values |= self.lines.found()
         given = Params().changed(self.params)
-        return {path: given[path] for path in POSED if path in given} | values if values else {}
+        posed = {path: given[path] for path in POSED if path in given}
+        return posed | values if values or self.preset else {}
 
     def contradiction(self) -> str:
         """What is wrong with the mounting or the clock taken so far, in a sentence; "" if nothing is, or if
-        that cannot be determined."""
+        that cannot be determined. Where none was given: the preset that has it."""
         (R, p), sensor, observed, parts = self.mounting, self.params.sensor, self.observed, []
         turned = np.linalg.norm(lie.log(lie.from_rpy_degrees(sensor.rotation).T @ R))
         if observed["rotation"] and turned > APART_ROTATION:
@@ -135,6 +139,8 @@ class Calibration:
         if observed["offset"] and abs(self.turned.late) > 5 * LARGEST_OFFSET:
             late = -self.turned.late * 1e3
             parts.append(f"the IMU's clock seems to be {abs(late):.0f} ms {'late' if late > 0 else 'early'}")
+        if self.preset and not parts:
+            parts.append(f"the clouds and the IMU are those of preset {self.preset}, which has the mounting")
         text = ", and ".join(parts)
         return text[:1].upper() + text[1:]
 
@@ -153,9 +159,12 @@ def calibrate(
     with open_recording(path, params) as recording:
         if not recording.imu_topic:
             raise HemislamError(f"{path} has no IMU, so there is nothing to calibrate.")
+        preset, mounting = "", built_in_mounting(recording.preset, recording.imu_topic)
+        if mounting and is_mounting_unknown(params):
+            preset, params = recording.preset, params.merged({"sensor": mounting})
         excerpt = read_excerpt(recording, params, duration_s, lambda done: progress(READING * done))
     try:
-        return calibrate_excerpt(path, params, excerpt, progress)
+        return calibrate_excerpt(path, params, excerpt, progress, preset)
     except np.linalg.LinAlgError as error:
         raise HemislamError(
             f"{path} cannot be calibrated ({error}); record again, walking slowly near walls."
@@ -163,9 +172,9 @@ def calibrate(
 
 
 def calibrate_excerpt(
-    path: Path, params: Params, excerpt: Excerpt, progress: Report = lambda fraction: None
+    path: Path, params: Params, excerpt: Excerpt, progress: Report = lambda fraction: None, preset: str = ""
 ) -> Calibration:
-    """As `calibrate`, of what was read already."""
+    """As `calibrate`, of what was read already. preset: from which the mounting in `params` is."""
     inertial = Inertial(excerpt.seconds(excerpt.imu.stamps_ns), excerpt.imu.gyro, excerpt.imu.accel)
     given = lie.from_rpy_degrees(params.sensor.rotation), np.array(params.sensor.translation, np.float64)
 
@@ -191,4 +200,6 @@ def calibrate_excerpt(
     down = moved.gravity / np.linalg.norm(moved.gravity)
     gyro_noise, accel_noise = (Noise.of(inertial.times, values) for values in (inertial.gyro, inertial.accel))
     residuals = alone, way.residual
-    return Calibration(path, params, excerpt.duration_s, turned, moved, down, residuals, gyro_noise, accel_noise, lines)
+    return Calibration(
+        path, params, preset, excerpt.duration_s, turned, moved, down, residuals, gyro_noise, accel_noise, lines
+    )

@@ -63,7 +63,7 @@ def calibrate(
         for name, value in rows:
             typer.echo(f"{name:<{width}}  {value}")
         if contradiction := found.contradiction():
-            typer.echo(f"{contradiction}, contrary to the parameters.")
+            typer.echo(f"{contradiction}.")
     if plot is not None:
         from app.evaluation.plots import residual_plot
 

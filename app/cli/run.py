@@ -90,7 +90,7 @@ def run(
         prepare_folder(folder, replace=force)
         for finding in session.findings:
             if finding.verdict != "fine":
-                typer.echo(f"{finding.verdict}: {finding.subject}: {finding.text} {finding.option}".rstrip())
+                typer.echo(f"{finding.verdict}: {finding.subject}: {finding}")
         compile_behind_bar()
         if session.loops:
             session.loops.only_results()

@@ -13,10 +13,16 @@ class Finding:
     Attributes:
         subject: what was examined, e.g. "point time". verdict: see `FindingVerdict`.
         text: what was found and how it was decided, in one sentence with units.
-        option: the option that settles it, e.g. "--set recording.time_unit=us"; "" if none.
+        option: what to set: where it needs the user, to settle it, e.g. "--set recording.time_field=none"; else only if
+            the finding is wrong. "" if nothing.
     """
 
     subject: str
     verdict: FindingVerdict
     text: str
     option: str = ""
+
+    def __str__(self) -> str:
+        """Text and option, as one line."""
+        use = self.option if self.verdict == "needs you" else f"(if that is wrong: {self.option})"
+        return f"{self.text} {use}" if self.option else self.text

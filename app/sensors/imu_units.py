@@ -138,10 +138,10 @@ def _acceleration_unit(norm: float, chosen: str) -> tuple[float, list[Finding]]:
             return scale, [Finding("IMU units", "fine", text)]
         return scale, [Finding("IMU units", "needs you", f"{text}, which is not gravity in it", f"{option}auto")]
     if fitting == "m/s2":
-        return 1.0, [Finding("IMU units", "fine", f"m/s²: {text}", f"{option}m/s2")]
+        return 1.0, [Finding("IMU units", "fine", f"m/s²: {text}")]
     if fitting is not None:
         text = f"{fitting}: {text}; scaled to m/s²"
-        return ACCELERATION_UNITS[fitting], [Finding("IMU units", "corrected", text, option + fitting)]
+        return ACCELERATION_UNITS[fitting], [Finding("IMU units", "corrected", text, f"{option}m/s2")]
     text = f"{text}, gravity in none of {', '.join(ACCELERATION_UNITS)}"
     for unit, scale in ACCELERATION_UNITS.items():
         if 6.5 < norm * scale < 15.0:  # a recording that begins amid walking may show so little or so much
@@ -164,7 +164,7 @@ def _gyroscope_unit(gyro: F64, sway: "Sway | None", chosen: str) -> tuple[float,
     errors = {unit: sway.error(scale) for unit, scale in GYROSCOPE_UNITS.items()}
     if turning > 3.0 and errors["deg/s"] < CLEARLY * errors["rad/s"]:
         text = "the gyroscope is in deg/s, by how gravity turns in the IMU's axes; scaled to rad/s"
-        return GYROSCOPE_UNITS["deg/s"], [Finding("IMU units", "corrected", text, f"{option}deg/s")]
+        return GYROSCOPE_UNITS["deg/s"], [Finding("IMU units", "corrected", text, f"{option}rad/s")]
     return 1.0, []
 
 

@@ -92,6 +92,12 @@ def preset_for(kind: str, probe: Probe) -> str:
     return next((name for name, appearance in _APPEARANCES.items() if appearance.fits(kind, probe)), "")
 
 
+def built_in_mounting(preset: str, imu_topic: str) -> dict[str, Any]:
+    """The preset's `sensor` section, if the IMU is the one inside the scanner, by its topic; else {}."""
+    values = PRESETS.get(preset, {})
+    return values.get("sensor", {}) if values.get("recording", {}).get("imu_topic") == imu_topic else {}
+
+
 CALIBRATED = "# Written by `hemislam calibrate`"
 """First line of a parameter file that hemislam wrote."""
 MERGED = f"{CALIBRATED} into the one kept as .old."

@@ -72,6 +72,7 @@ class Recording(AbstractContextManager["Recording"]):
         path, params: as given. topics: all there are. lidar_topic, imu_topic, gnss_topic: the ones used; ""
             where there is none.
         scan_count: messages on the LiDAR topic. findings: of the first messages.
+        preset: of the scanner that the clouds look like; "" if they look like none that is known.
         start_ns: first point of the first usable scan. duration_s: from there to the last message.
     """
 
@@ -97,7 +98,8 @@ class Recording(AbstractContextManager["Recording"]):
         self.duration_s = max((source.end_ns - probes[0].log_ns) / 1e9, 0.0) + (scans[0].end_ns - self.start_ns) / 1e9
         scan_times = [(probe.log_ns, scan.stamp_ns, scan.end_ns) for probe, scan in zip(probes, scans, strict=True)]
         self._clocks = Finding("clocks", "fine", "there is one only")
-        imu_findings = self._look_at_imu(np.array(scan_times, np.int64), preset_for(lidar.type, probes[0]))
+        self.preset = preset_for(lidar.type, probes[0])
+        imu_findings = self._look_at_imu(np.array(scan_times, np.int64))
         self.findings: tuple[Finding, ...] = (
             *source.findings,
             lidar_finding,
@@ -109,7 +111,7 @@ class Recording(AbstractContextManager["Recording"]):
             *imu_findings,
         )
 
-    def _look_at_imu(self, scan_times: I64, preset: str) -> list[Finding]:
+    def _look_at_imu(self, scan_times: I64) -> list[Finding]:
         """Settle how its samples are read, by the first ones; `scan_times` as for `clock_finding`."""
         self._imu_stamped, self._imu_units = True, AS_RECORDED
         if not self.imu_topic:
@@ -118,7 +120,7 @@ class Recording(AbstractContextManager["Recording"]):
         imu, self._imu_stamped, probe_findings = probe_imu(self._source, self.imu_topic, chosen.imu_time_offset)
         self._imu_units, imu_findings = settle_imu(imu, chosen)
         self._clocks = clock_finding(scan_times, np.column_stack([imu.log_ns, imu.stamps_ns]), chosen.imu_time_offset)
-        gravity = gravity_findings(imu, self._imu_units, self.params, preset)
+        gravity = gravity_findings(imu, self._imu_units, self.params, self.preset)
         return [*probe_findings, *imu_findings, self._clocks, *gravity]
 
     @property

@@ -112,10 +112,9 @@ def _settle_unit(
         finding = Finding("point time", "needs you", problem, "--set recording.time_field=none")
     elif not fits:
         finding = Finding("point time", "needs you", misfit, "--set recording.time_unit=auto")
-    elif chosen.time_unit != "auto":
-        finding = Finding("point time", "fine", f"{facts}, as you set it")
     else:
-        finding = Finding("point time", "fine", facts, f"--set recording.time_unit={unit}")
+        facts += ", as you set it" if chosen.time_unit != "auto" else ""
+        finding = Finding("point time", "fine", facts)
     return UNITS_NS[unit], problem, finding
 
 
@@ -198,13 +197,15 @@ def _header_by_delay(clouds: list[Probe], duration_ns: float) -> tuple[End, Find
     """The header's point, judged by how long after it the clouds were logged; without evidence, the last."""
     delay = log_delay_ns(clouds)
     if delay is None:
-        return _header("last", "the recording does not show it, so as most drivers do by default", "needs you")
+        return _header(
+            "last", "the recording does not show it, and most drivers do so; if yours stamps the first:", "needs you"
+        )
     text = f"the clouds were logged {delay / 1e6:.0f} ms after it, and a scan takes {duration_ns / 1e6:.0f} ms"
     if delay < 0.5 * duration_ns:
         return _header("last", text, "corrected")
     if 0.9 * duration_ns < delay < 3 * duration_ns:
         return _header("first", text, "corrected")
-    return _header("last", f"{text}, which shows neither, so as most drivers do by default", "needs you")
+    return _header("last", f"{text}, which shows neither; most drivers do so; if yours stamps the first:", "needs you")
 
 
 def _header(end: End, evidence: str, verdict: FindingVerdict) -> tuple[End, Finding]:

@@ -17,7 +17,7 @@ MID360 = np.array([-0.011, -0.02329, 0.04412])
 TURN = Rotation.from_euler("ZYX", [104.0, -50.0, 70.0], degrees=True).as_matrix()
 
 
-def known(recording: Path, *, sure: bool = True, params: Params | None = None) -> Calibration:
+def known(recording: Path, *, sure: bool = True, params: Params | None = None, preset: str = "") -> Calibration:
     """What might have been found."""
     wide = 1e-6 if sure else 1.0
     rows = np.linspace(0.0, 0.01, 30).reshape(-1, 3)
@@ -26,6 +26,7 @@ def known(recording: Path, *, sure: bool = True, params: Params | None = None) -
     return Calibration(
         recording,
         params or Params(),
+        preset,
         30.0,
         turned,
         moved,

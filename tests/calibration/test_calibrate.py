@@ -19,7 +19,7 @@ from app.calibration.lines import Lines
 from app.calibration.odometry import track
 from app.calibration.words import WALK, as_json, table, write_beside
 from app.evaluation.plots import residual_plot
-from app.sensors.presets import calibrated_beside, resolve_params, sidecar
+from app.sensors.presets import built_in_mounting, calibrated_beside, resolve_params, sidecar
 from app.sensors.recording import open_recording
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -49,6 +49,19 @@ def test_a_lidar_turned_on_its_imu_and_a_late_clock_are_found_from_the_recording
     assert np.allclose(named, found.turned.R_imu_lidar, atol=1e-4)
     assert "rotated by 70°, -50°, 104°" in found.contradiction()
     assert "clock seems to be 30 ms early" in found.contradiction()
+
+
+def test_a_scanner_with_an_imu_inside_is_recognised_and_its_mounting_taken(shared_data: Path) -> None:
+    found = calibrate(shared_data / "hall_mid360.mcap", Params())
+    assert np.allclose(found.found()["sensor.translation"], MID360, atol=0.01)
+    assert found.contradiction() == "The clouds and the IMU are those of preset mid360, which has the mounting"
+
+
+def test_a_mounting_of_a_preset_counts_for_the_imu_inside_only(tmp_path: Path) -> None:
+    assert np.allclose(built_in_mounting("mid360", "/livox/imu")["translation"], MID360)
+    assert built_in_mounting("mid360", "/imu") == built_in_mounting("velodyne", "/imu") == {}
+    turned = known(tmp_path / "walk.mcap", preset="mid360")  # the scans contradict the preset
+    assert turned.contradiction().startswith("The LiDAR seems to be rotated by 70°, -50°, 104°")
 
 
 def test_reading_skips_the_rest_at_the_start(excerpt: Excerpt, shared_data: Path) -> None:

@@ -1,5 +1,7 @@
 """What a driver leaves open is decided rightly from the data, and the decision is explained."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,6 +55,14 @@ def test_a_header_at_the_last_point_is_noticed_because_the_cloud_was_logged_too_
     assert time_error_ns(probes[0], layout) < FIRING_NS + 1_000
     assert findings["header stamp"].verdict == "corrected"
     assert findings["header stamp"].option == "--set recording.header_stamp=first"
+
+
+def test_the_setting_of_a_decision_that_is_right_is_offered_only_in_case_it_is_wrong() -> None:
+    """Whoever types all that a report proposes must not undo what is right."""
+    right = Finding("header stamp", "fine", "of the first point", "--set recording.header_stamp=last")
+    assert str(right) == "of the first point (if that is wrong: --set recording.header_stamp=last)"
+    assert str(replace(right, verdict="needs you")) == "of the first point --set recording.header_stamp=last"
+    assert str(replace(right, option="")) == "of the first point"
 
 
 def test_the_user_overrides_the_header_convention() -> None:

@@ -227,7 +227,7 @@ def test_the_imu_is_where_the_metadata_puts_it_and_missed_if_it_is_silent(tmp_pa
     metadata = metadata_beside(path)
     assert metadata is not None
     findings = {finding.subject: finding for finding in OusterStream(path, metadata).findings}
-    assert "sensor.translation=[-0.00600, 0.01100, -0.00700]" in findings["unit's mount"].option
+    assert "sensor.translation=[-0.00600, 0.01100, -0.00700]" in findings["unit's mount"].text
     assert findings["IMU"].verdict == "needs you"
 
 

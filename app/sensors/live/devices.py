@@ -52,8 +52,10 @@ def device_of(packets: Iterable[bytes]) -> Device | None:
 
 
 def mount_finding(T_imu_lidar: F64) -> Finding:
-    """The mount that a unit reports, with the options that set it. T_imu_lidar: (4, 4), m."""
+    """The mount that a unit reports, and how to use it. T_imu_lidar: (4, 4), m."""
     place = ", ".join(f"{x:.5f}" for x in T_imu_lidar[:3, 3])
     angles = ", ".join(f"{angle:.2f}" for angle in lie.rpy_degrees(T_imu_lidar[:3, :3]))
     option = f"--set 'sensor.translation=[{place}]' --set 'sensor.rotation=[{angles}]'"
-    return Finding("unit's mount", "fine", "the unit itself says how its LiDAR sits relative to its IMU", option)
+    return Finding(
+        "unit's mount", "fine", f"the unit says how its LiDAR sits relative to its IMU; to use that: {option}"
+    )

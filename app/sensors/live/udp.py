@@ -205,8 +205,7 @@ class PacketReceiver:
             return
         intake.put_status("connected", "LiDAR", intake.sensor)
         if difop.T_imu_lidar is not None:
-            mount = mount_finding(difop.T_imu_lidar)
-            intake.put_status("configuration", "LiDAR", f"{mount.text}: {mount.option}")
+            intake.put_status("configuration", "LiDAR", mount_finding(difop.T_imu_lidar).text)
 
     def _give(self, now: int, intake: Intake) -> None:
         """Decode and hand on; at the start, once the angles are known or their time is up."""
