@@ -158,6 +158,8 @@ class Engine:
                     adrift, why = True, "the IMU is silent" if len(samples) else "there is no IMU"
                     registration = replace(registration, reason=f"{registration.reason}, and {why}")
         posterior = posterior if gapless else imu.after_gap(posterior, belief)
+        if registration.surprise > iekf.SURPRISING:
+            posterior = imu.with_open_speed(posterior)
         if iekf.is_imu_to_blame(registration):
             posterior = imu.with_open_biases(posterior)
         status = FrameStatus.LOST if adrift else _status(waiting, self._map.voxels > 0, registration)

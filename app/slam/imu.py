@@ -28,6 +28,8 @@ GAP_RATE, GAP_NOISE = 1.0, 1.0
 """rad/s, m/s²/√Hz: in a gap, standard deviation of the rate of turn and noise density of the acceleration; those of a
 walking person's hand."""
 
+WALKING = 1.5
+"""m/s: standard deviation of a walking person's velocity while nothing is known of it."""
 BIAS_LEAPS = 0.005, 0.05
 """rad/s, m/s²: how far the biases of a consumer IMU may leap by a knock or a restart. Larger leaps take more frames."""
 
@@ -142,6 +144,13 @@ def after_gap(belief: Belief, before: Belief) -> Belief:
     covariance[BG] = covariance[:, BG] = 0.0
     covariance[BG, BG] = before.covariance[BG, BG]
     return Belief(replace(belief.state, b_gyro=before.state.b_gyro), covariance)
+
+
+def with_open_speed(belief: Belief) -> Belief:
+    """The belief after a scan has contradicted it: the speed may have run away while scans showed little."""
+    covariance = belief.covariance.copy()
+    covariance[VEL, VEL] += WALKING**2 * np.eye(3)
+    return replace(belief, covariance=covariance)
 
 
 def with_open_biases(belief: Belief) -> Belief:

@@ -10,15 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import coast, lie
-from app.slam.imu import BA, BG, DIM, EXT, GRAV, POS, ROT, VEL, Belief
+from app.slam.imu import BA, BG, DIM, EXT, GRAV, POS, ROT, VEL, WALKING, Belief
 from app.slam.kernels import manifold
 from app.slam.params import Params
 from app.slam.types import ImuSamples, Scan
 
 PAUSE_S = 1.5
 """Of neither scans nor IMU samples. After less, the motion is bridged to centimetres."""
-WALKING = 1.5
-"""m/s: standard deviation of the velocity when the recording goes on."""
 TILTED = 0.15
 """rad: standard deviation of the direction of gravity as a walking person's accelerometer shows it in one scan."""
 SETTLED_S = 2.0

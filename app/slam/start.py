@@ -5,7 +5,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.slam import lie, rest
-from app.slam.imu import BA, BG, DIM, EXT, EXT_POS, EXT_ROT, GRAV, POS, POSE, ROT, VEL, Belief, mounting_to_pose
+from app.slam.imu import (
+    BA,
+    BG,
+    DIM,
+    EXT,
+    EXT_POS,
+    EXT_ROT,
+    GRAV,
+    POS,
+    POSE,
+    ROT,
+    VEL,
+    WALKING,
+    Belief,
+    mounting_to_pose,
+)
 from app.slam.params import Params
 from app.slam.types import F64, ImuSamples, NavState, Scan
 
@@ -67,7 +82,7 @@ def standing(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
 def moving(imu: ImuSamples, stamp_ns: int, params: Params) -> Belief:
     """Belief in motion: only the direction of gravity is known, roughly."""
     sigma = _sigma()
-    sigma[VEL] = 1.5  # walking
+    sigma[VEL] = WALKING
     sigma[BG] = 0.02
     sigma[GRAV] = 0.15
     return _belief(imu, stamp_ns, np.zeros(3), sigma, params)

@@ -129,6 +129,21 @@ def test_biases_that_leap_are_found_again() -> None:
     assert max(r.registration.surprise for r in results[41:50]) > iekf.SURPRISING
 
 
+@pytest.mark.parametrize("wrong", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
+def test_a_speed_that_ran_away_where_nothing_was_seen_is_found_again(wrong: tuple[float, float, float]) -> None:
+    """The filter is sure of it, and the map begins anew, so that every scan is mapped where the wrong speed puts it."""
+    engine, walk = Engine(params_for(REAL)), room_walk(80)
+    nothing = engine.checkpoint().map
+    before = run(engine, walk[:40])
+    state = engine.checkpoint()
+    assert state.progress.belief is not None
+    here = state.progress.belief.state
+    belief = replace(state.progress.belief, state=replace(here, v_odom_imu=here.v_odom_imu + wrong))
+    engine.restore(replace(state, map=nothing, progress=replace(state.progress, belief=belief)))
+    metres, _ = worst([*before, *run(engine, walk[40:])], Walk(), since=50)
+    assert metres < 0.2  # half of it before the second scan
+
+
 @pytest.mark.parametrize("begin_s", [0.35, 2.02, 4.02])
 def test_an_imu_that_stops_for_good_leaves_the_walk_to_the_scans(begin_s: float) -> None:
     """It stops while the device still rests for the start, at the first steps, or amid the walk."""
