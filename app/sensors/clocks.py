@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from app.sensors.findings import Finding
-from app.slam.types import I64
+from app.slam.types import I64, Scan
 
 TOLERANCE_S = 0.15
 """Drivers log a scan up to this late; a smaller difference is delay, not another clock."""
@@ -42,6 +42,14 @@ def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
     else:
         text = f"LiDAR and IMU stamps agree within {abs(offset) * 1e3:.0f} ms, judged by when they were logged{applied}"
     return Finding("clocks", "fine", text)
+
+
+def without_copies(times: list[tuple[int, int, int]], scans: list[Scan]) -> list[tuple[int, int, int]]:
+    """The times, as above, of each scan once: some recorders write a message twice."""
+    once: dict[tuple[int, bytes], tuple[int, int, int]] = {}
+    for of_scan, scan in zip(times, scans, strict=True):
+        once.setdefault((scan.stamp_ns, scan.points.tobytes()), of_scan)
+    return list(once.values())
 
 
 def overlap_finding(scans: I64, topic: str) -> list[Finding]:

@@ -74,7 +74,7 @@ def examine(
             *(finding for finding in recording.findings if finding.subject not in known),
             _rate("scan rate", scans[:, 1], 4.0),
             *(of_imu if recording.imu_topic else ()),
-            *_scan_time(scans),
+            *_scan_time(scans, census.copies),
             *_of_pauses(pauses),
             _pairing(counts.paired, census.reasons),
             _returns(census, len(scans)),
@@ -88,7 +88,7 @@ class _Census:
     Attributes:
         scan_times: log time, begin and end of each scan, ns. imu_times: log time and stamp of each sample.
         places: points that the messages have room for. nan, returns: how many of them are.
-        refused: points that cannot be returns. reasons: why scans are left out.
+        refused: points that cannot be returns. copies: scans that came twice. reasons: why scans are left out.
     """
 
     sequencer: Sequencer
@@ -98,6 +98,8 @@ class _Census:
     nan: int = 0
     refused: int = 0
     returns: int = 0
+    copies: int = 0
+    last: Scan | None = None
     reasons: Counter[str] = field(default_factory=Counter)
 
     def add(self, entry: ScanEntry | ImuEntry | OtherEntry) -> None:
@@ -105,13 +107,17 @@ class _Census:
             self.imu_times.append((entry.log_ns, entry.stamp_ns))
             self.sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
         elif isinstance(entry, ScanEntry):
-            if entry.cloud is not None:
-                self.places += len(entry.cloud)
-                self.nan += int(np.isnan(entry.cloud.xyz()).any(axis=1).sum())
             if isinstance(entry.scan, Scan):
+                if _is_copy(entry.scan, self.last):
+                    self.copies += 1
+                    return
+                self.last = entry.scan
                 self.scan_times.append((entry.log_ns, entry.scan.stamp_ns, entry.scan.end_ns))
                 self.returns += len(entry.scan)
                 self.refused += entry.scan.refused
+            if entry.cloud is not None:
+                self.places += len(entry.cloud)
+                self.nan += int(np.isnan(entry.cloud.xyz()).any(axis=1).sum())
             self.sequencer.add_scan(entry.scan)
         self.take(last=False)
 
@@ -217,14 +223,18 @@ def _imu_values(counts: Counts, samples: int, limits: ImuParams) -> Finding:
     return Finding("IMU values", verdict, f"of {samples} samples {wrong}; those are left out")
 
 
-def _scan_time(scans: I64) -> list[Finding]:
+def _is_copy(scan: Scan, other: Scan | None) -> bool:
+    return other is not None and scan.stamp_ns == other.stamp_ns and np.array_equal(scan.points, other.points)
+
+
+def _scan_time(scans: I64, copies: int) -> list[Finding]:
     steps = np.diff(scans[:, 1])
     forward = steps[steps > 0]
     if not len(forward):
         return []
     usual = float(np.median(forward))
     missing = int(np.rint(forward[forward > 1.5 * usual] / usual - 1).sum())
-    wrong = _listed((int((steps < 0).sum()), "steps back"), (missing, "missing"))
+    wrong = _listed((int((steps < 0).sum()), "steps back"), (missing, "missing"), (copies, "came twice"))
     longest = float(forward.max()) / 1e9
     text = f"{wrong}; the longest interval is {longest:.3f} s" if wrong else "no scan missing or repeated"
     return [Finding("scan time", "corrected" if wrong else "fine", text)]

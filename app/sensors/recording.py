@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.sensors.clocks import clock_finding, overlap_finding
+from app.sensors.clocks import clock_finding, overlap_finding, without_copies
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.findings import Finding
 from app.sensors.imu_units import AS_RECORDED, gravity_findings, settle_imu
@@ -104,7 +104,7 @@ class Recording(AbstractContextManager["Recording"]):
             *source.findings,
             lidar_finding,
             imu_finding,
-            *overlap_finding(np.array(scan_times, np.int64), self.lidar_topic),
+            *overlap_finding(np.array(without_copies(scan_times, scans), np.int64), self.lidar_topic),
             *probe_findings,
             *cloud_findings,
             *line_findings(scans, self.has_lines, params.sensor),

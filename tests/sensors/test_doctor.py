@@ -66,6 +66,29 @@ def test_a_pause_of_the_recorder_is_told_once_and_is_no_fault_of_the_imu(tmp_pat
     assert "at 1.0 s" in found["pauses"].text and found["IMU gaps"].verdict == "fine"
 
 
+def test_scans_that_came_twice_are_no_second_lidar(tmp_path: Path) -> None:
+    entries = [
+        (topic, log + late, sent)
+        for topic, log, sent in rig.walk(turns=20, columns=4)
+        for late in ((0, 100_000) if topic == "/points" else (0,))
+    ]
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert "scans" not in found and found["pairing"].verdict == "fine"
+    assert found["scan time"].verdict == "corrected" and "20 came twice" in found["scan time"].text
+
+
+def test_two_lidars_that_turn_in_step_are_still_two(tmp_path: Path) -> None:
+    entries = []
+    for topic, log, sent in rig.walk(turns=20, columns=4):
+        entries.append((topic, log, sent))
+        if topic == "/points":
+            other = rig.turn((log - rig.START_NS) // rig.PERIOD_NS - 1, columns=4)
+            other.points = -other.points
+            entries.append((topic, log + 100_000, rig.message(other)))
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert "two LiDARs" in found["scans"].text and found["pairing"].verdict == "needs you"
+
+
 def test_zeros_in_place_of_imu_samples_are_named_and_are_a_gap(tmp_path: Path) -> None:
     entries = [
         (topic, log, rig.imu(log, accel=(0.0, 0.0, 0.0)) if topic == "/imu" and 5 < n / 20 < 10 else sent)
