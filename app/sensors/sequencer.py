@@ -38,6 +38,8 @@ GYRO, ACCEL = slice(0, 3), slice(3, 6)
 SPIKE_FLOOR = ((GYRO, 0.5), (ACCEL, 3.0))
 """rad/s, m/s^2: a sample that differs less from its neighbours is never a spike."""
 STUCK_SAMPLES = 200
+COARSE = (0.005, 0.05)
+"""rad/s, m/s^2: in steps larger than this, an IMU at rest reads the same number for long, and nothing is stuck."""
 SPIKE_TO_NEIGHBOURS, SPIKE_TO_USUAL = 4.0, 10.0
 """A spike deviates from the line between its neighbours by this many times their difference and the usual deviation."""
 
@@ -91,6 +93,8 @@ class Sequencer:
     _begun: bool = False
     _same: list[int] = field(default_factory=lambda: [0] * 6)
     """For how many samples each axis has read the same number."""
+    _finest: list[float] = field(default_factory=lambda: [math.inf] * 2)
+    """Smallest step between successive samples, on any axis: rad/s, m/s^2."""
 
     def copy(self) -> "Sequencer":
         """An independent copy in the same state. Scans and samples are shared: they never change."""
@@ -168,12 +172,17 @@ class Sequencer:
             self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
 
     def _note_stuck_axes(self, values: tuple[float, ...]) -> None:
-        """An axis with noise never reads the same number for long."""
+        """An axis with noise never reads the same number for long, unless its steps hide the noise."""
         if not self._values:
             return
         for axis, (last, value) in enumerate(zip(self._values[-1], values, strict=True)):
-            self._same[axis] = self._same[axis] + 1 if value == last else 0
-            if self._same[axis] == STUCK_SAMPLES:
+            part = axis // 3
+            if value != last:
+                self._same[axis] = 0
+                self._finest[part] = min(self._finest[part], abs(value - last))
+                continue
+            self._same[axis] += 1
+            if self._same[axis] == STUCK_SAMPLES and self._finest[part] < COARSE[part]:
                 self.counts.imu_stuck += 1
                 name = f"{'accelerometer' if axis > 2 else 'gyroscope'} {'xyz'[axis % 3]}"
                 self._notices.append(f"the {name} has read the same number for {STUCK_SAMPLES} samples: it is stuck")

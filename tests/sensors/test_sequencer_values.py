@@ -32,6 +32,16 @@ def given_on(values: F64) -> tuple[list[int], Sequencer]:
     return (only.imu.stamps_ns // (10 * MS)).tolist(), sequencer
 
 
+def test_an_axis_that_freezes_is_stuck_and_one_read_in_coarse_steps_is_not() -> None:
+    still = np.random.default_rng(0).normal(size=(600, 6)) * [*[0.002] * 3, *[0.02] * 3] + [0, 0, 0, 0, 0, 9.81]
+    step = np.array([0.06] * 3 + [0.3] * 3)
+    _, sequencer = given_on(np.vstack([np.rint(swaying(1) / step) * step, np.rint(still / step) * step]))
+    assert sequencer.counts.imu_stuck == 0
+    still[200:, 2] = still[200, 2]
+    _, sequencer = given_on(still)
+    assert sequencer.counts.imu_stuck == 1
+
+
 @given(st.integers(0, 1000))
 @settings(max_examples=30, deadline=None)
 def test_no_sample_of_a_vigorous_walk_is_refused(seed: int) -> None:
