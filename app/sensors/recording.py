@@ -10,6 +10,7 @@ import numpy as np
 
 from app.sensors.clocks import clock_finding, overlap_finding, without_copies
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
+from app.sensors.distances import distance_findings
 from app.sensors.findings import Finding
 from app.sensors.imu_units import AS_RECORDED, gravity_findings, settle_imu
 from app.sensors.layout import settle_cloud
@@ -108,6 +109,7 @@ class Recording(AbstractContextManager["Recording"]):
             *probe_findings,
             *cloud_findings,
             *line_findings(scans, self.has_lines, params.sensor),
+            *distance_findings(scans, params.sensor),
             *imu_findings,
         )
 

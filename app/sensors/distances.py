@@ -1,0 +1,51 @@
+"""Whether the points of a recording are as far as a LiDAR measures: in metres, and none where nothing came back."""
+
+import math
+
+import numpy as np
+
+from app.sensors.findings import Finding
+from app.slam.sections import SensorParams
+from app.slam.types import F64, U16, Scan
+
+NEAREST_M, USUAL_M = 10.0, 100.0
+"""A walk has points nearer than the one, and most of them are nearer than the other."""
+SAME_M, SAME_SHARE, SAME_LINES = 0.001, 0.05, 3
+"""So many points, on so many lines, are never equally far; on one line they are, where the floor is level."""
+
+
+def distance_findings(scans: list[Scan], params: SensorParams) -> list[Finding]:
+    """Coordinates that are not in metres, or missing returns written as a distance, in a recording's first scans."""
+    distances = np.linalg.norm(np.concatenate([scan.points for scan in scans]).astype(np.float64), axis=1)
+    return _not_metres(distances) or _missing(distances, np.concatenate([scan.ring for scan in scans]), params)
+
+
+def _not_metres(distances: F64) -> list[Finding]:
+    nearest, usual = np.percentile(distances, [1, 50])
+    if nearest < NEAREST_M or usual < USUAL_M:
+        return []
+    unit, parts = ("mm", 1000) if math.sqrt(nearest * usual) > 700 else ("cm", 100)  # 0.7 to 7 m on a walk
+    text = (
+        f"half of the points are beyond {usual:.0f} m and hardly any within {nearest:.0f} m: x, y and z seem to be in "
+        f"{unit}; make the driver write metres, or divide them by {parts}"
+    )
+    return [Finding("distances", "needs you", text)]
+
+
+def _missing(distances: F64, ring: U16, params: SensorParams) -> list[Finding]:
+    steps, counts = np.unique(np.rint(distances / SAME_M), return_counts=True)
+    distance = float(steps[counts.argmax()]) * SAME_M
+    same = np.abs(distances - distance) < SAME_M
+    beyond = np.count_nonzero(distances[~same] > distance)
+    if (
+        distance > params.max_range
+        or same.mean() < SAME_SHARE
+        or len(np.unique(ring[same])) < SAME_LINES
+        or beyond > 0.5 * np.count_nonzero(~same)
+    ):
+        return []
+    text = (
+        f"{same.mean():.0%} of the points are exactly {distance:g} m away: the driver writes missing returns so; "
+        "set the maximum range below that"
+    )
+    return [Finding("distances", "needs you", text, f"--set sensor.max_range={0.99 * distance:.3g}")]
