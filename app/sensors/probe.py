@@ -8,7 +8,7 @@ import numpy as np
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, Probe, stamped
 from app.sensors.findings import Finding
 from app.sensors.imu_units import ImuProbe, measured
-from app.sensors.ros import IMU, imu_values, stamp_ns
+from app.sensors.ros import IMU, imu_values, instead_of_times, stamp_ns
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
 
@@ -90,10 +90,8 @@ def probe_clouds(source: Source, topic: Topic) -> tuple[list[Probe], list[Findin
     if unusable:
         text = f"{unusable} of the first {unusable + len(probes)} clouds have no usable point and are left out"
         findings.append(Finding("empty clouds", "corrected", text))
-    probes = stamped(probes)
-    if not probes[0].stamped:
-        findings.append(_unstamped(topic.name))
-    return probes, findings
+    findings += _stamp_findings([probe.cloud.stamp_ns for probe in probes], topic.name)
+    return stamped(probes), findings
 
 
 def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProbe, bool, list[Finding]]:
@@ -109,7 +107,7 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
         values.append(imu_values(message))
         if log_ns - logs[0] > PROBED_IMU_NS:
             break
-    has_stamps = len(set(stamps)) > 1
+    findings = _stamp_findings(stamps, topic)
     rows = np.array(values, np.float64).reshape(-1, 6)
     good = measured(rows[:, :3], rows[:, 3:])
     if not good.any():
@@ -117,13 +115,16 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
             f"The first {len(rows)} IMU samples on {topic} in {source.path} are all NaN or absurd; "
             "check the IMU's driver."
         )
-    times = np.array(stamps if has_stamps else logs, np.int64) + round(time_offset_s * 1e9)
+    times = np.array(logs if findings else stamps, np.int64) + round(time_offset_s * 1e9)
     probe = ImuProbe(np.array(logs, np.int64)[good], times[good], rows[good, :3], rows[good, 3:])
-    return probe, has_stamps, [] if has_stamps else [_unstamped(topic)]
+    return probe, not findings, findings
 
 
-def _unstamped(topic: str) -> Finding:
-    return Finding("stamps", "corrected", f"the headers of {topic} carry no time; the log times are used instead")
+def _stamp_findings(stamps: list[int], topic: str) -> list[Finding]:
+    if not (carried := instead_of_times(stamps)):
+        return []
+    text = f"the headers of {topic} carry {carried}; the log times are used instead, less exact: check the driver"
+    return [Finding("stamps", "corrected", text)]
 
 
 def _readable(entries: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:

@@ -68,6 +68,15 @@ def stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
+def instead_of_times(stamps: list[int]) -> str:
+    """What headers carry that is no time of a message: the same for all, or whole seconds for several; "" if times."""
+    different = set(stamps)
+    if len(different) < 2:
+        return "no time"
+    whole = len(different) < len(stamps) and not any(stamp % 1_000_000_000 for stamp in different)
+    return "whole seconds only" if whole else ""
+
+
 def imu_values(message: Any) -> tuple[Vector, Vector]:
     """Angular velocity and acceleration of an Imu, in its own units."""
     w, a = message.angular_velocity, message.linear_acceleration

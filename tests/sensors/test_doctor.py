@@ -6,6 +6,7 @@ Tests app/sensors/clocks.py.
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from app.sensors.doctor import examine
 from app.sensors.findings import Finding
@@ -153,6 +154,19 @@ def test_a_clock_that_was_set_on_the_way_is_named(tmp_path: Path) -> None:
     ]
     found = by_subject(rig.write(tmp_path / "walk", entries))
     assert found["clocks"].verdict == "needs you" and "changes by 0.400 s" in found["clocks"].text
+
+
+@pytest.mark.parametrize("coarse", ["/imu", "/points"])
+def test_stamps_in_whole_seconds_are_named_and_are_no_other_clock(coarse: str, tmp_path: Path) -> None:
+    entries = rig.walk(turns=20, layout=rig.Layout(absolute=False, fields=rig.RELATIVE), columns=4)
+    for topic, _, sent in entries:
+        if topic == coarse:
+            sent.header.stamp.nanosec = 0
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert found["stamps"].verdict == "corrected"
+    assert f"the headers of {coarse} carry whole seconds only; the log times are used" in found["stamps"].text
+    for subject in ("clocks", "IMU rate", "IMU gaps", "IMU time", "scan rate", "scan time", "pairing"):
+        assert found[subject].verdict == "fine", found[subject]
 
 
 def test_the_gravity_finding_follows_the_imu(tmp_path: Path) -> None:
