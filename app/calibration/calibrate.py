@@ -13,7 +13,7 @@ from app.calibration.guide import Guide
 from app.calibration.inertial import Inertial, Noise
 from app.calibration.lines import Lines, fit_lines
 from app.calibration.odometry import track
-from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
+from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation, is_mirrored
 from app.calibration.translation import Moved, fit_translation
 from app.sensors.presets import built_in_mounting
 from app.sensors.recording import open_recording
@@ -37,6 +37,10 @@ POSED = "sensor.rotation", "sensor.translation", "recording.imu_time_offset"
 
 Report = Callable[[float], None]
 """Is called with the fraction done, 0-1."""
+
+
+class MirroredError(HemislamError):
+    """The gyroscope's axes are not those of any IMU, however it is mounted."""
 
 
 def is_mounting_unknown(params: Params) -> bool:
@@ -154,7 +158,7 @@ def calibrate(
         duration_s: how much of it to use. progress: called with the fraction done, 0-1.
 
     Raises:
-        HemislamError: the recording cannot be read, has no IMU, or is too short.
+        HemislamError: the recording cannot be read, has no IMU, or is too short; MirroredError.
     """
     with open_recording(path, params) as recording:
         if not recording.imu_topic:
@@ -184,6 +188,11 @@ def calibrate_excerpt(
     way = track(excerpt, None, report(0))
     alone = way.residual
     late = find_offset(way, inertial)
+    if is_mirrored(way, inertial, late):
+        raise MirroredError(
+            f"The gyroscope in {path} turns as the LiDAR does in a mirror: one of its axes has the wrong sign, or two "
+            "are exchanged; correct the driver, or try --set recording.gyroscope_axes=-xyz, x-yz or xy-z."
+        )
     turned = fit_rotation(way, inertial, first_rotation(way, inertial, late), late, given[0])
     guide = Guide.of(inertial, turned.R_imu_lidar, turned.late, turned.bias)
     lines, seen = Lines.none(excerpt.lines), excerpt

@@ -18,6 +18,8 @@ WIDEST = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])
 """Standard deviations of rotation (rad), offset (s) and bias (rad/s) where nothing determines them."""
 STEPS, SLIPPED = 20, 3.0
 """Most steps of the fit; windows whose differences exceed this many times the usual ones are errors of the odometry."""
+CLEARLY = 0.5
+"""The IMU is mirrored if in a mirror its turns differ from the LiDAR's by less than this times what they do without."""
 WINDOW = 10
 """Scans over which attitudes are compared: a second. The gyroscope's noise grows with it, the odometry's does not."""
 
@@ -59,7 +61,24 @@ def find_offset(track: Track, inertial: Inertial) -> float:
 
 def first_rotation(track: Track, inertial: Inertial, late: float) -> F64:
     """R_imu_lidar (3, 3) that turns the LiDAR's rotation vectors onto the IMU's (Wahba 1965), without a guess."""
-    ours, theirs = lie.log(_turns(track)), lie.log(inertial.turns(track.times, late, np.zeros(3)))
+    return _aligned(*_vectors(track, inertial, late))
+
+
+def is_mirrored(track: Track, inertial: Inertial, late: float) -> bool:
+    """Whether the IMU turns as the LiDAR does in a mirror, which no mounting explains."""
+    ours, theirs = _vectors(track, inertial, late)
+    right, mirrored = (
+        np.median(np.linalg.norm(signed - ours @ _aligned(ours, signed).T, axis=1)) for signed in (theirs, -theirs)
+    )
+    return bool(mirrored < CLEARLY * right)
+
+
+def _vectors(track: Track, inertial: Inertial, late: float) -> tuple[F64, F64]:
+    """(n, 3) rotation vectors from scan to scan, of the LiDAR and of the IMU."""
+    return lie.log(_turns(track)), lie.log(inertial.turns(track.times, late, np.zeros(3)))
+
+
+def _aligned(ours: F64, theirs: F64) -> F64:
     fits = np.abs(np.linalg.norm(ours, axis=1) - np.linalg.norm(theirs, axis=1)) < FAR
     weights = fits.astype(np.float64)
     R = np.eye(3)

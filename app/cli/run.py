@@ -116,8 +116,8 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
     if not is_mounting_unknown(params):
         return params, ""
     found = _contradicted(recording, params, "Estimating the pose of the LiDAR on the IMU")
-    if found is None:
-        return params, ""
+    if isinstance(found, str):
+        return params, found
     advised = f"{found.contradiction()}; this was found in the recording and is used. To save it: {_saving(recording)}"
     typer.echo(advised)
     return params.with_values(found.found()), advised
@@ -126,19 +126,21 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
 def look_for_mounting(recording: Path, params: "Params") -> str:
     """What the recording shows about its mounting if the parameters differ, in a sentence; "" if nothing."""
     found = _contradicted(recording, params, "Looking for the cause")
-    return f"{found.contradiction()}: {_saving(recording)}" if found else ""
+    return found if isinstance(found, str) else f"{found.contradiction()}: {_saving(recording)}"
 
 
-def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration | None":
-    """The calibration, if mounting or clock differ from the parameters; None if they do not, or if that is unknown."""
-    from app.calibration.calibrate import calibrate
+def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration | str":
+    """The calibration, if mounting or clock differ from the parameters; else why there can be none, "" if unknown."""
+    from app.calibration.calibrate import MirroredError, calibrate
 
     with progress_bar(why) as show:
         try:
             found = calibrate(recording, params, UNASKED_S, show)
+        except MirroredError as error:
+            return str(error)
         except HemislamError:  # such as too short a recording; opening it reports what is wrong with it
-            return None
-    return found if found.contradiction() else None
+            return ""
+    return found if found.contradiction() else ""
 
 
 def _saving(recording: Path) -> str:

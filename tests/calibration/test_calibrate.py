@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.calibration.calibrate import calibrate, calibrate_excerpt
+from app.calibration.calibrate import MirroredError, calibrate, calibrate_excerpt
 from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.lines import Lines
 from app.calibration.odometry import track
 from app.calibration.words import WALK, as_json, table, write_beside
+from app.cli.run import look_for_mounting, settle_mounting
 from app.evaluation.plots import residual_plot
 from app.sensors.presets import built_in_mounting, calibrated_beside, resolve_params, sidecar
 from app.sensors.recording import open_recording
@@ -62,6 +63,21 @@ def test_a_mounting_of_a_preset_counts_for_the_imu_inside_only(tmp_path: Path) -
     assert built_in_mounting("mid360", "/imu") == built_in_mounting("velodyne", "/imu") == {}
     turned = known(tmp_path / "walk.mcap", preset="mid360")  # the scans contradict the preset
     assert turned.contradiction().startswith("The LiDAR seems to be rotated by 70°, -50°, 104°")
+
+
+def test_a_mirrored_gyroscope_is_named_instead_of_a_mounting(excerpt: Excerpt) -> None:
+    imu = replace(excerpt.imu, gyro=excerpt.imu.gyro * [1.0, -1.0, 1.0])
+    with pytest.raises(MirroredError, match=r"in a mirror: .*gyroscope_axes=-xyz, x-yz or xy-z"):
+        calibrate_excerpt(Path("walk.mcap"), Params(), Excerpt(excerpt.scans, imu))
+
+
+def test_info_and_run_tell_of_a_mirrored_gyroscope(monkeypatch: pytest.MonkeyPatch) -> None:
+    def found(*_: object) -> None:
+        raise MirroredError("It is mirrored.")
+
+    monkeypatch.setattr("app.calibration.calibrate.calibrate", found)
+    assert look_for_mounting(Path("walk.mcap"), Params()) == "It is mirrored."
+    assert settle_mounting(Path("walk.mcap"), Params()) == (Params(), "It is mirrored.")
 
 
 def test_reading_skips_the_rest_at_the_start(excerpt: Excerpt, shared_data: Path) -> None:

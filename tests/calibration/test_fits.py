@@ -2,6 +2,8 @@
 app/calibration/guide.py: the fits, on exact motions of a hand with the noise of both sensors; SciPy integrates nothing
 here, the motion is a spline whose derivatives are exact."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from app.calibration.guide import Guide
 from app.calibration.inertial import Inertial, Noise
 from app.calibration.odometry import Track
-from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation
+from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation, is_mirrored
 from app.calibration.translation import fit_translation
 from app.sensors.simulator.trajectory import SmoothTrajectory
 from app.slam.types import F64
@@ -73,6 +75,21 @@ def test_a_lidar_turned_in_any_way_on_the_imu_is_found_without_a_guess(seed: int
     assert (np.abs(off) < 4.5 * np.sqrt(np.diag(found.covariance)[:3])).all()
     assert np.abs(found.bias - GYRO_BIAS).max() < 1e-3
     assert np.sqrt(np.mean(found.after**2)) < 0.2 * np.sqrt(np.mean(found.before**2))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_mirrored_gyroscope_is_told_from_any_mounting(seed: int) -> None:
+    track, inertial = sensed(hand(30.0), Rotation.random(random_state=seed).as_matrix(), 0.01, seed=seed)
+    assert not is_mirrored(track, inertial, 0.01)
+    for change in (np.diag([-1, 1, 1]), np.diag([1, 1, -1]), np.eye(3)[[1, 0, 2]], -np.eye(3)):
+        assert is_mirrored(track, replace(inertial, gyro=inertial.gyro @ change), 0.01)
+
+
+@pytest.mark.parametrize("turning", [(0.4, 0.0, 0.0), (0.0, 0.0, 0.0)])
+def test_turning_about_one_axis_does_not_show_a_mirror(turning: tuple[float, float, float]) -> None:
+    track, inertial = sensed(hand(30.0, turning), np.eye(3), 0.0)
+    assert not is_mirrored(track, inertial, 0.0)
+    assert not is_mirrored(track, replace(inertial, gyro=inertial.gyro @ np.diag([1, 1, -1])), 0.0)
 
 
 def test_odometry_that_slips_for_seconds_hardly_moves_the_rotation() -> None:
