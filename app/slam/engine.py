@@ -34,6 +34,7 @@ class EngineProgress:
         floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
         lines: estimated errors of the scan lines. clock: estimated offset of the IMU's clock.
         paused: the pause after which there is no keyframe yet; None: there is none.
+        contradicted: whether a scan contradicted the prediction since the last keyframe.
     """
 
     frame: int = 0
@@ -46,6 +47,7 @@ class EngineProgress:
     lines: LineErrors = field(default_factory=LineErrors.unknown)
     clock: ClockOffset = field(default_factory=ClockOffset)
     paused: Interruption | None = None
+    contradicted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,9 @@ class EngineState:
     keyframes: int
 
 
+ASTRAY_M = 2.0
+"""m: standard deviation of where odometry has led since scans showed little, if the first scan behind contradicts it: a
+speed wrong by 0.5 m/s for some seconds."""
 _Fuse = Callable[[LocalMap, FilterParams], tuple[Belief, Registration]]
 
 
@@ -158,6 +163,7 @@ class Engine:
                     adrift, why = True, "the IMU is silent" if len(samples) else "there is no IMU"
                     registration = replace(registration, reason=f"{registration.reason}, and {why}")
         posterior = posterior if gapless else imu.after_gap(posterior, belief)
+        contradicted = before.contradicted or registration.surprise > iekf.SURPRISING
         if registration.surprise > iekf.SURPRISING:
             posterior = imu.with_open_speed(posterior)
         if iekf.is_imu_to_blame(registration):
@@ -188,7 +194,8 @@ class Engine:
         keyframe, certainty = None, before.certainty
         if due:
             certainty = (certainty or Certainty.begin(posterior, refined=p.filter.estimate_extrinsics)).moved(posterior)
-            keyframe = self._keyframe(posterior, cloud, certainty, 0 if paused is None else paused.end_ns)
+            resumed_ns, astray = 0 if paused is None else paused.end_ns, ASTRAY_M if contradicted else 0.0
+            keyframe = self._keyframe(posterior, cloud, certainty, resumed_ns, astray)
         watch.lap("keyframe")
 
         if status is not before.status and FrameStatus.LOST in (status, before.status):
@@ -225,6 +232,7 @@ class Engine:
             lines=lines,
             clock=clock,
             paused=paused if settling else None,
+            contradicted=contradicted and keyframe is None,
         )
         return result
 
@@ -274,7 +282,7 @@ class Engine:
         T = belief.state.T_odom_lidar.astype(np.float32)
         self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
 
-    def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty, resumed_ns: int) -> Keyframe:
+    def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty, resumed_ns: int, astray: float) -> Keyframe:
         state = belief.state
         covariance = certainty.in_map(belief)
         keyframe = Keyframe(
@@ -287,6 +295,7 @@ class Engine:
             cloud=cloud,
             drift=certainty.covariance(belief) - covariance,
             resumed_ns=resumed_ns,
+            astray=astray,
         )
         self.keyframes.append(keyframe)
         return keyframe

@@ -25,6 +25,7 @@ _HEAD = np.dtype(
         ("covariance", "<f8", (6, 6)),
         ("drift", "<f8", (6, 6)),
         ("resumed_ns", "<i8"),
+        ("astray", "<f8"),
         ("points", "<i8"),
     ]
 )
@@ -102,6 +103,7 @@ class KeyframeStore:
             cloud=Cloud(**columns),
             drift=head["drift"].copy(),
             resumed_ns=int(head["resumed_ns"]),
+            astray=float(head["astray"]),
         )
 
     def when(self, index: int) -> tuple[int, int, int]:
@@ -116,9 +118,8 @@ class KeyframeStore:
     def append(self, keyframe: Keyframe) -> None:
         cloud = keyframe.cloud
         head = np.zeros((), dtype=_HEAD)
-        for name in ("frame", "stamp_ns", "T_odom_imu", "T_imu_lidar", "covariance", "drift", "resumed_ns"):
-            head[name] = getattr(keyframe, name)
-        head["points"] = len(cloud)
+        for name in _HEAD.names or ():
+            head[name] = len(cloud) if name == "points" else getattr(keyframe, name)
         begin = self._ends[self._count - 1] if self._count else 0
         end = begin + head.nbytes + len(cloud) * _POINT_BYTES
         self._file.seek(begin)

@@ -279,6 +279,8 @@ class Keyframe:
         cloud: in the LiDAR frame at `stamp_ns`.
         drift: (6, 6) what adds to it since the first keyframe.
         resumed_ns: when the scans went on, if it is the first after a pause (`app.slam.pause`); otherwise 0.
+        astray: m, standard deviation of what odometry may be off since the last keyframe, if a scan contradicted it;
+            otherwise 0.
     """
 
     index: int
@@ -290,6 +292,7 @@ class Keyframe:
     cloud: Cloud
     drift: F64 = field(default_factory=lambda: np.zeros((6, 6)))
     resumed_ns: int = 0
+    astray: float = 0.0
 
 
 class FrameStatus(StrEnum):

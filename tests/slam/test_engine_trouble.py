@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.slam import iekf
-from app.slam.engine import Engine
+from app.slam.engine import ASTRAY_M, Engine
 from app.slam.types import FrameStatus, ImuSamples, Measurement, Scan
 from tests.slam.engine_runs import FRAMES, REAL, assert_all_same, errors, room_walk, run, worst
 from tests.slam.scenes import (
@@ -140,7 +140,10 @@ def test_a_speed_that_ran_away_where_nothing_was_seen_is_found_again(wrong: tupl
     here = state.progress.belief.state
     belief = replace(state.progress.belief, state=replace(here, v_odom_imu=here.v_odom_imu + wrong))
     engine.restore(replace(state, map=nothing, progress=replace(state.progress, belief=belief)))
-    metres, _ = worst([*before, *run(engine, walk[40:])], Walk(), since=50)
+    after = run(engine, walk[40:])
+    assert [r.keyframe.astray for r in before if r.keyframe] == [0.0] * sum(r.keyframe is not None for r in before)
+    assert next(r.keyframe.astray for r in after if r.keyframe and r.index > 41) == ASTRAY_M
+    metres, _ = worst([*before, *after], Walk(), since=50)
     assert metres < 0.2  # half of it before the second scan
 
 

@@ -72,7 +72,7 @@ class Detector:
         self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
-        self._resumed = np.empty(0, np.bool_)
+        self._resumed, self._astray = np.empty(0, np.bool_), np.empty(0)
         self.stand(0, ())
 
     def __len__(self) -> int:
@@ -98,6 +98,11 @@ class Detector:
         return self._resumed[: len(self)]
 
     @property
+    def astray(self) -> F64:
+        """(k,) m, as of keyframes."""
+        return self._astray[: len(self)]
+
+    @property
     def pauses_before(self) -> I64:
         """(k,) number of pauses before each."""
         return np.cumsum(self.resumed)
@@ -108,6 +113,7 @@ class Detector:
         self._poses = np.concatenate([self._poses, keyframe.T_odom_imu[None]])
         self._stamps = np.append(self._stamps, keyframe.stamp_ns)
         self._resumed = np.append(self._resumed, keyframe.resumed_ns > 0)
+        self._astray = np.append(self._astray, keyframe.astray)
         self._submaps.append(keyframe)
 
     def stand(self, count: int, contexts: Sequence[ScanContext]) -> None:
@@ -130,7 +136,8 @@ class Detector:
         if len(self._heads) == len(self):
             return
         del self._heads[len(self) :]
-        self._poses, self._stamps, self._resumed = self.poses, self._stamps[: len(self)], self.resumed
+        self._poses, self._stamps = self.poses, self._stamps[: len(self)]
+        self._resumed, self._astray = self.resumed, self.astray
         self._submaps.truncate(len(self))
         self._around.cache_clear()
         self._prepared.cache_clear()

@@ -110,17 +110,25 @@ class Expectation:
         return Deviation(sigmas, abs(float(error[5])) / float(np.sqrt(covariance[5, 5])), float(error[5]))
 
 
-def expect(root: int, poses: F64, loops: Sequence[LoopEdge], drift: Drift, resumed: Mask | None = None) -> Expectation:
+def expect(
+    root: int,
+    poses: F64,
+    loops: Sequence[LoopEdge],
+    drift: Drift,
+    resumed: Mask | None = None,
+    astray: F64 | float = 0.0,
+) -> Expectation:
     """What the graph of poses (k, 4, 4) T_map_imu with these loops expects, seen from keyframe `root`.
 
     Args:
-        resumed: (k,) which keyframes are the first after a pause; None: there was none.
+        resumed: (k,) which keyframes are the first after a pause; None: there was none. astray: (k,) m, of each
+            keyframe.
     """
     count, loops = len(poses), [loop for loop in loops if not loop.open]
     p = poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
     resumed = np.zeros(count, np.bool_) if resumed is None else resumed
-    steps += PAUSE_M * resumed[1:]
+    steps += PAUSE_M * resumed[1:] + np.broadcast_to(astray, count)[1:] / drift.translation
     pairs = np.array([loop.pair for loop in loops], dtype=np.int64).reshape(-1, 2)
     measured = np.array([loop.T_older_newer for loop in loops]).reshape(-1, 4, 4)
     left = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]  # what the graph leaves of each loop

@@ -77,7 +77,8 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
 
     The filter gives the covariance of each pose in its map, which it takes as exact, not that of the step between them.
     So the covariances of both poses are added, as if they were independent (an upper bound), and drift is added as a
-    random walk: constant over `EVEN_M`, independent beyond. A step across a pause is a guess.
+    random walk: constant over `EVEN_M`, independent beyond. A step across a pause is a guess, one that a scan
+    contradicted nearly so.
     """
     T = lie.inverse(before.T_odom_imu) @ after.T_odom_imu
     walked = float(np.linalg.norm(T[:3, 3]))
@@ -89,6 +90,7 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
     covariance[:3, :3] += STILL_RAD**2 * np.eye(3) + drift.rotation**2 * even * np.outer(up, up)
     covariance[3:, 3:] += (STILL_M**2 + drift.translation**2 * even) * np.eye(3)
     covariance[3:, 3:] += (drift.height**2 - drift.translation**2) * even * np.outer(up, up)
+    covariance[3:, 3:] += after.astray**2 * np.eye(3)
     if after.resumed_ns:
         covariance[:3, :3] += PAUSE_TILT**2 * np.eye(3) + LOST_RAD**2 * np.outer(up, up)
         covariance[3:, 3:] += LOST_M**2 * np.eye(3)

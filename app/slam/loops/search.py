@@ -186,7 +186,7 @@ class Search:
         updates: dict[Pair, LoopEdge] = {}
         for newer in keyframes:
             accepted = [edge for edge in known.values() if edge.verdict is Verdict.ACCEPTED]
-            expectation = expect(newer, poses, accepted, drift, detector.resumed)
+            expectation = expect(newer, poses, accepted, drift, detector.resumed, detector.astray)
             fresh = {edge.pair: edge for edge in self._judged(newer, expectation, params) if edge.pair not in known}
             known, settled = known | fresh, list(fresh.values())
             if any(edge.verdict is Verdict.CANDIDATE for edge in settled):

@@ -108,7 +108,8 @@ def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
     elif edit.guess:
         fit = assess(*both, refine(*both, register(*both, rough(*both, guess)[0])))
     else:
-        fit = _place(older, newer, detector, expect(newer, poses, (), Drift.of(params), detector.resumed), params).fit
+        expectation = expect(newer, poses, (), Drift.of(params), detector.resumed, detector.astray)
+        fit = _place(older, newer, detector, expectation, params).fit
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added manually: overlap {100 * fit.overlap:.0f} %, residual {fit.residual_rms * 1e3:.0f} mm"
     T = _imu(detector, older, newer, fit.T_target_source) if edit.register else T_older_newer

@@ -34,6 +34,13 @@ def test_doubt_grows_with_the_way_not_with_the_distance() -> None:
     assert expectation.position_sigmas()[0] > 0.4 > expectation.position_sigmas()[60]
 
 
+def test_where_odometry_may_have_gone_astray_all_before_is_in_doubt() -> None:
+    points = square()
+    astray = 2.0 * (np.arange(len(points)) == 40)
+    sigmas = expect(80, path(points), [], DRIFT, astray=astray).position_sigmas()
+    assert (sigmas[40:] < 0.5).all() and (sigmas[:40] > 2.0).all()
+
+
 def test_the_lever_arm_is_what_a_steady_turn_does_to_the_end_of_the_walk() -> None:
     """Against walking the square again with a small steady turn."""
     poses, rate = path(square()), 1e-5

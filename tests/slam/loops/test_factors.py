@@ -1,5 +1,7 @@
 """Factors of the graph from odometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -35,3 +37,9 @@ def test_a_step_late_in_a_walk_is_as_certain_as_an_early_one() -> None:
         odometry_factor(1, keyframe(0.0, d), keyframe(1.0, d), Drift(0.01, 0.002, 0.001)) for d in (0.0, 1.0)
     )
     np.testing.assert_array_equal(early.covariance, late.covariance)
+
+
+def test_a_step_that_a_scan_contradicted_is_loose() -> None:
+    step = odometry_factor(1, keyframe(0.0), replace(keyframe(1.0), astray=2.0), Drift(0.01, 0.002, 0.0))
+    assert np.sqrt(np.diag(step.covariance)[3:]) == pytest.approx(2.0, rel=0.01)
+    assert np.sqrt(np.diag(step.covariance)[:3]).max() < 0.01
