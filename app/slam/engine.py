@@ -144,12 +144,16 @@ class Engine:
         watch.lap("downsample")
 
         # paper 2.3, eq. 5-7
-        posterior, registration, adrift = predicted, _NOT_REGISTERED, False
+        posterior, registration, adrift, contradicted = predicted, _NOT_REGISTERED, False, before.contradicted
         if self._map.voxels:
             if course is None:
                 chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
                 fuse = partial(iekf.update, predicted, chosen)
                 posterior, registration = self._update(belief, predicted, fuse)
+                if registration.surprise > iekf.SURPRISING:  # once more, as if nothing were known of the speed
+                    contradicted = True
+                    open_speed = imu.with_open_speed(predicted, (end_ns - belief.state.stamp_ns) * 1e-9)
+                    posterior, _ = self._update(belief, predicted, partial(iekf.update, open_speed, chosen))
             else:  # the points themselves, since centroids have no time
                 source, refines = reduced.source[sampled.source], p.filter.estimate_extrinsics and gapless
                 fuse = partial(coast.update, predicted, scan.part(source), course, extrinsics=refines)
@@ -163,9 +167,6 @@ class Engine:
                     adrift, why = True, "the IMU is silent" if len(samples) else "there is no IMU"
                     registration = replace(registration, reason=f"{registration.reason}, and {why}")
         posterior = posterior if gapless else imu.after_gap(posterior, belief)
-        contradicted = before.contradicted or registration.surprise > iekf.SURPRISING
-        if registration.surprise > iekf.SURPRISING:
-            posterior = imu.with_open_speed(posterior)
         if iekf.is_imu_to_blame(registration):
             posterior = imu.with_open_biases(posterior)
         status = FrameStatus.LOST if adrift else _status(waiting, self._map.voxels > 0, registration)

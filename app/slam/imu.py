@@ -146,10 +146,11 @@ def after_gap(belief: Belief, before: Belief) -> Belief:
     return Belief(replace(belief.state, b_gyro=before.state.b_gyro), covariance)
 
 
-def with_open_speed(belief: Belief) -> Belief:
-    """The belief after a scan has contradicted it: the speed may have run away while scans showed little."""
+def with_open_speed(belief: Belief, seconds: float) -> Belief:
+    """The belief if nothing was known of the speed so long ago."""
     covariance = belief.covariance.copy()
-    covariance[VEL, VEL] += WALKING**2 * np.eye(3)
+    for a, b, factor in ((VEL, VEL, 1.0), (POS, VEL, seconds), (VEL, POS, seconds), (POS, POS, seconds**2)):
+        covariance[a, b] += factor * WALKING**2 * np.eye(3)
     return replace(belief, covariance=covariance)
 
 
