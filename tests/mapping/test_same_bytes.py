@@ -17,16 +17,16 @@ from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.mapping.session_file import SUFFIX, read_session, write_session
 from app.sensors.presets import resolve_params
-from app.sensors.simulator import simulate
-from app.sensors.simulator.imperfections import IMPERFECT, NONE
-from app.sensors.simulator.trajectory import Walker
 from app.server.controller import Controller
 from app.server.fold import Fold
+from app.server.keeping import AddNote
 from app.server.protocol import (
     Command,
     EditLoop,
     OpenRecording,
     Play,
+    RedoLoop,
+    Restart,
     Save,
     Seek,
     SetParams,
@@ -36,25 +36,26 @@ from app.server.protocol import (
     UndoLoop,
 )
 from app.server.publisher import Publisher
-from app.slam.loops.edits import Add, Reject
+from app.slam.loops import edit_files
+from app.slam.loops.edits import Accept, Add, Reject, SetWeight
 from app.slam.loops.service import InlineLoops
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.params import Params
+from tests.rounds import AS_LOOPS, walk_round
 
 SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))
 FILES = ("trajectory.tum", "trajectory_odometry.tum", "loops.csv", "graph.g2o", "map.ply")
-LENGTH_S = 40.0
-"""As far as its first loops; the other recordings are shorter."""
+LENGTH_S = 16.0
+"""As far as the sample's first loops, if so short ones count; the other recordings are shorter."""
+SHORT = ("--duration", str(LENGTH_S), "--set", AS_LOOPS)
 ROOMS = ["perfect", "imperfect"]
-ROUND_S, LEAST_S = 12.0, 4
-"""Length of a brisk walk round a room and back to its begin, and `loops.min_time` by which that is a loop."""
 
 
 class Workbench:
     """The engine's side of the workbench."""
 
     def __init__(self, recording: Path) -> None:
-        self._params = resolve_params(recording, None, None, [])
+        self._params = resolve_params(recording, None, None, [AS_LOOPS])
         self._page, self._fold = Publisher(self._params), Fold()
         self.controller = Controller(self._page, self._params, self._open)
         self.controller.open(recording, None)
@@ -90,9 +91,15 @@ def accepted(snapshot: Snapshot) -> list[LoopEdge]:
 
 
 def hemislam(folder: Path, *words: str) -> dict[str, bytes]:
+    call(folder, *words)
+    return read(folder)
+
+
+def call(folder: Path, *words: str) -> str:
+    """What the command line prints."""
     result = CliRunner().invoke(cli, [*words, "--out", str(folder)])
     assert result.exit_code == 0, result.output
-    return read(folder)
+    return result.output
 
 
 @pytest.fixture(scope="module", params=["sample", *ROOMS])
@@ -100,13 +107,7 @@ def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     """The sample, and two that are simulated."""
     if request.param == "sample":
         return SAMPLE
-    path = tmp_path_factory.mktemp("simulated") / "room.mcap"
-    seed, errors = (0, NONE) if request.param == "perfect" else (3, IMPERFECT)
-    brisk = Walker(speed=1.8, still=1.5)
-    simulate("room", path, duration_s=ROUND_S, seed=seed, every_block=10, walker=brisk, imperfections=errors)
-    with path.with_suffix(".params.yaml").open("a") as file:
-        file.write(f"loops:\n  min_time: {LEAST_S}\n")
-    return path
+    return walk_round(tmp_path_factory.mktemp("simulated") / "room.mcap", perfect=request.param == "perfect")
 
 
 @pytest.fixture
@@ -121,7 +122,7 @@ def test_an_undisturbed_session_a_replay_and_a_run_write_the_same(
     assert ended.transport.finished and accepted(ended)
     ours = workbench.saved(tmp_path / "page")
     workbench.controller.close()
-    assert hemislam(tmp_path / "run", "run", str(recording), "--duration", str(LENGTH_S)) == ours
+    assert hemislam(tmp_path / "run", "run", str(recording), *SHORT) == ours
     assert hemislam(tmp_path / "replay", "replay", str(tmp_path / "page" / f"session{SUFFIX}")) == ours
 
 
@@ -152,3 +153,36 @@ def test_a_session_with_detours_edits_other_parameters_and_a_fork_is_replayed_to
     for name in ("end", "fork", "before"):
         again = hemislam(tmp_path / f"{name}-again", "replay", str(tmp_path / name / f"session{SUFFIX}"))
         assert again == saved[name], name
+
+
+@pytest.mark.parametrize("recording", ["imperfect"], indirect=True)
+def test_playing_again_from_the_end_or_restarting_keeps_the_edits(workbench: Workbench, tmp_path: Path) -> None:
+    last = accepted(workbench.do(Play()))[-1].pair
+    unedited = workbench.saved(tmp_path / "unedited")
+    workbench.do(EditLoop(Reject(*last)), AddNote("a door"))
+    edited = workbench.saved(tmp_path / "edited")
+    assert edited != unedited
+    assert workbench.do(Play()).transport.finished
+    assert workbench.saved(tmp_path / "played") == edited
+    restarted = workbench.do(Restart(), Play())
+    assert restarted.transport.finished and restarted.notes[-1].text == "a door"
+    assert restarted.loops.undo == (Reject(*last),) and last not in [edge.pair for edge in accepted(restarted)]
+    workbench.do(UndoLoop())
+    assert workbench.saved(tmp_path / "undone") == unedited
+    workbench.controller.close()
+
+
+@pytest.mark.parametrize("recording", ["imperfect"], indirect=True)
+def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(
+    recording: Path, workbench: Workbench, tmp_path: Path
+) -> None:
+    first, *_, last = (edge.pair for edge in accepted(workbench.do(Play())))
+    workbench.do(EditLoop(Reject(*first)), EditLoop(SetWeight(*last, 0.1)))
+    snapshot = workbench.do(EditLoop(Accept(*first)), UndoLoop(), RedoLoop(), UndoLoop())
+    path = tmp_path / "edits.yaml"
+    path.write_text(edit_files.write(snapshot.loops.undo) + "- accept: [1, 2]\n")
+    ours = workbench.saved(tmp_path / "page")
+    workbench.controller.close()
+    printed = call(tmp_path / "headless", "run", str(recording), *SHORT, "--loops", str(path))
+    assert "Accept 1-2 has no effect" in printed
+    assert read(tmp_path / "headless") == ours

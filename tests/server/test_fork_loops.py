@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from test_fork import SAMPLE, both_at, same, until
+from test_fork import both_at, same, until
 
 from app.sensors.presets import resolve_params
 from app.server.fork import Workspace
@@ -14,16 +14,18 @@ from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.loops.edits import SetWeight
 from app.slam.loops.types import Pair, Verdict
+from tests.rounds import AS_LOOPS, walk_round
 
-LENGTH_S, BEFORE, LAST = 41.0, 401, 409
+BEFORE, LAST = 110, 118
 
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
-    """A where the recording that ships has its first loops, and B from there on."""
-    params = resolve_params(SAMPLE, None, None, [])
+    """A where a walk round a room has its first loops, and B from there on."""
     folder = tmp_path_factory.mktemp("kept")
-    setup = Setup(SAMPLE, params=params, duration_s=LENGTH_S, speed=math.inf, session_folder=folder)
+    recording = walk_round(folder / "room.mcap")
+    params = resolve_params(recording, None, None, [AS_LOOPS])
+    setup = Setup(recording, params=params, speed=math.inf, session_folder=folder)
     workspace = Workspace(EngineProcess(setup), setup, EngineProcess)
     until(lambda: workspace.snapshot, lambda s: s.transport.frame == 0)
     workspace.send(Seek(BEFORE))

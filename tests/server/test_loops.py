@@ -11,23 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_rewind import SAMPLE, Bench
-from typer.testing import CliRunner
 
-from app.__main__ import cli
 from app.export.results import BY_RUN
 from app.mapping.checkpoints import DEFAULT_BYTES
 from app.mapping.loops import LoopProcess, RestartingLoops
 from app.mapping.opening import open_session
 from app.mapping.session import Session
 from app.sensors.presets import resolve_params
-from app.server.keeping import AddNote
 from app.server.protocol import (
     EditLoop,
     InspectLoop,
     Pause,
     Play,
-    RedoLoop,
-    Restart,
     Save,
     Seek,
     SetSpeed,
@@ -35,8 +30,7 @@ from app.server.protocol import (
     TryLoop,
     UndoLoop,
 )
-from app.slam.loops import edit_files
-from app.slam.loops.edits import Accept, Reject, SetWeight
+from app.slam.loops.edits import Reject, SetWeight
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.params import Params
 
@@ -108,21 +102,6 @@ def test_back_and_on_again_gives_the_same_files(walk: Walk, files: dict[str, byt
     assert walk.saved(tmp_path) == files
 
 
-def test_playing_again_from_the_end_or_restarting_keeps_the_edits(
-    walk: Walk, files: dict[str, bytes], tmp_path: Path
-) -> None:
-    last = accepted(walk.end())[-1].pair
-    walk.do(EditLoop(Reject(*last)), AddNote("a door"))
-    edited = walk.saved(tmp_path / "edited")
-    assert walk.do(Play()).transport.finished
-    assert walk.saved(tmp_path / "played") == edited
-    restarted = walk.do(Restart(), Play())
-    assert restarted.transport.finished and restarted.notes[-1].text == "a door"
-    assert restarted.loops.undo == (Reject(*last),) and last not in [edge.pair for edge in accepted(restarted)]
-    walk.do(UndoLoop())
-    assert walk.saved(tmp_path / "undone") == files
-
-
 def test_before_a_loop_is_found_the_map_is_where_odometry_has_it(walk: Walk) -> None:
     early = walk.do(Seek(200))
     assert not accepted(early)
@@ -145,27 +124,6 @@ def test_all_rejected_leaves_odometry_and_undone_leaves_nothing(
     back = walk.do(*(UndoLoop() for _ in loops))
     assert len(accepted(back)) == len(loops) and len(back.loops.redo) == len(loops)
     assert walk.saved(tmp_path / "undone") == files
-
-
-def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(walk: Walk, tmp_path: Path) -> None:
-    loops = accepted(walk.end())
-    snapshot = walk.do(
-        EditLoop(Reject(*loops[0].pair)),
-        EditLoop(SetWeight(*loops[-1].pair, 0.1)),
-        EditLoop(Accept(*loops[0].pair)),
-        UndoLoop(),
-        RedoLoop(),
-        UndoLoop(),
-    )
-    path = tmp_path / "edits.yaml"
-    path.write_text(edit_files.write(snapshot.loops.undo) + "- accept: [1, 2]\n")
-    ours = walk.saved(tmp_path / "page")
-    walk.do(UndoLoop(), UndoLoop())
-    words = ["run", str(SAMPLE), "--duration", str(LENGTH_S), "--loops", str(path), "--out", str(tmp_path / "headless")]
-    result = CliRunner().invoke(cli, words)
-    assert result.exit_code == 0, result.output
-    assert "Accept 1-2 has no effect" in result.output
-    assert {name: (tmp_path / "headless" / name).read_bytes() for name in FILES} == ours
 
 
 def test_a_loop_can_be_looked_at_and_a_command_tried_without_doing_it(walk: Walk) -> None:
