@@ -89,7 +89,7 @@ def test_flats_that_look_alike_stay_beside_one_another_even_if_odometry_drifts_m
 
 
 def test_storeys_that_look_alike_stay_above_one_another() -> None:
-    walk = take("storeys", 120.0)
+    walk = take("storeys", 75.0)
     backend = drive(walk.drifted(0.01, 0.02), PARAMS)
     loops = accepted(backend)
     errors = np.array([error(edge, walk.truth) for edge in loops])
