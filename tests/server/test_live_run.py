@@ -29,7 +29,7 @@ from app.slam.loops.service import InlineLoops
 from app.slam.params import Params
 from app.slam.types import StepResult
 
-LENGTH_S = 9.0
+LENGTH_S = 7.0
 PATIENCE_S = 90.0
 
 
@@ -190,7 +190,7 @@ def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_ma
     live: Live, from_file: dict[int, np.ndarray]
 ) -> None:
     thread = live.play(1.0)
-    live.until(lambda s: s.transport.frame >= 35)
+    live.until(lambda s: s.transport.frame >= 25)
     live.engine.send(AddNote("a door"))
     before = live.until(lambda s: bool(s.notes))
     assert live.engine.pid is not None
