@@ -8,7 +8,7 @@ from app.sensors.simulator.trajectory import Walker
 
 ROUND_S = 12.0
 AS_LOOPS = "loops.min_time=4"
-"""The setting by which coming back so soon is a loop."""
+"""The setting that lets so short a round count as a loop."""
 
 
 def walk_round(path: Path, *, perfect: bool = False) -> Path:

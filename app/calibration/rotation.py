@@ -19,7 +19,8 @@ WIDEST = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])
 STEPS, SLIPPED = 20, 3.0
 """Most steps of the fit; windows whose differences exceed this many times the usual ones are errors of the odometry."""
 CLEARLY = 0.5
-"""The IMU is mirrored if in a mirror its turns differ from the LiDAR's by less than this times what they do without."""
+"""The IMU counts as mirrored if its turns, seen in a mirror, differ from the LiDAR's by less than this share of how
+much they differ as they are."""
 WINDOW = 10
 """Scans over which attitudes are compared: a second. The gyroscope's noise grows with it, the odometry's does not."""
 

@@ -44,12 +44,9 @@ def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
     return Finding("clocks", "fine", text)
 
 
-def without_copies(times: list[tuple[int, int, int]], scans: list[Scan]) -> list[tuple[int, int, int]]:
-    """The times, as above, of each scan once: some recorders write a message twice."""
-    once: dict[tuple[int, bytes], tuple[int, int, int]] = {}
-    for of_scan, scan in zip(times, scans, strict=True):
-        once.setdefault((scan.stamp_ns, scan.points.tobytes()), of_scan)
-    return list(once.values())
+def is_copy(scan: Scan, before: Scan | None) -> bool:
+    """Whether a scan is the one before it once more: some recorders write a message twice."""
+    return before is not None and scan.stamp_ns == before.stamp_ns and np.array_equal(scan.points, before.points)
 
 
 def overlap_finding(scans: I64, topic: str) -> list[Finding]:

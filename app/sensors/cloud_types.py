@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.livox import CUSTOM_MSGS, CustomMsg
-from app.sensors.ros import DATATYPES, instead_of_times, stamp_ns
+from app.sensors.ros import DATATYPES, stamp_fault, stamp_ns
 from app.slam.errors import printable
 from app.slam.types import F32, U8
 
@@ -199,7 +199,7 @@ class Probe:
 
 def stamped(probes: list[Probe]) -> list[Probe]:
     """The same, or stamped by their log times where their headers carry no times."""
-    if not instead_of_times([probe.cloud.stamp_ns for probe in probes]):
+    if not stamp_fault([probe.cloud.stamp_ns for probe in probes]):
         return probes
     return [Probe(probe.log_ns, replace(probe.cloud, stamp_ns=probe.log_ns), stamped=False) for probe in probes]
 

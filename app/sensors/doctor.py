@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.sensors.clocks import clock_finding
+from app.sensors.clocks import clock_finding, is_copy
 from app.sensors.cloud_types import CLOUD_TYPES
 from app.sensors.findings import Finding as Finding
 from app.sensors.findings import FindingVerdict
@@ -108,7 +108,7 @@ class _Census:
             self.sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
         elif isinstance(entry, ScanEntry):
             if isinstance(entry.scan, Scan):
-                if _is_copy(entry.scan, self.last):
+                if is_copy(entry.scan, self.last):
                     self.copies += 1
                     return
                 self.last = entry.scan
@@ -221,10 +221,6 @@ def _imu_values(counts: Counts, samples: int, limits: ImuParams) -> Finding:
         return Finding("IMU values", "fine", f"none beyond {bounds}, no spikes")
     verdict: FindingVerdict = "corrected" if left_out < 0.01 * samples else "needs you"
     return Finding("IMU values", verdict, f"of {samples} samples {wrong}; those are left out")
-
-
-def _is_copy(scan: Scan, other: Scan | None) -> bool:
-    return other is not None and scan.stamp_ns == other.stamp_ns and np.array_equal(scan.points, other.points)
 
 
 def _scan_time(scans: I64, copies: int) -> list[Finding]:

@@ -13,8 +13,8 @@ class Finding:
     Attributes:
         subject: what was examined, e.g. "point time". verdict: see `FindingVerdict`.
         text: what was found and how it was decided, in one sentence with units.
-        option: what to set: where it needs the user, to settle it, e.g. "--set recording.time_field=none"; else only if
-            the finding is wrong. "" if nothing.
+        option: if the verdict is "needs you", what settles it, e.g. "--set recording.time_field=none"; otherwise what
+            to set in case the finding is wrong. "" if there is nothing to set.
     """
 
     subject: str

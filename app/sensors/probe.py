@@ -8,7 +8,7 @@ import numpy as np
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, Probe, stamped
 from app.sensors.findings import Finding
 from app.sensors.imu_units import ImuProbe, measured
-from app.sensors.ros import IMU, imu_values, instead_of_times, stamp_ns
+from app.sensors.ros import IMU, imu_values, stamp_fault, stamp_ns
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
 
@@ -121,7 +121,7 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
 
 
 def _stamp_findings(stamps: list[int], topic: str) -> list[Finding]:
-    if not (carried := instead_of_times(stamps)):
+    if not (carried := stamp_fault(stamps)):
         return []
     text = f"the headers of {topic} carry {carried}; the log times are used instead, less exact: check the driver"
     return [Finding("stamps", "corrected", text)]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.sensors.clocks import clock_finding, overlap_finding, without_copies
+from app.sensors.clocks import clock_finding, is_copy, overlap_finding
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.distances import distance_findings
 from app.sensors.findings import Finding
@@ -98,6 +98,8 @@ class Recording(AbstractContextManager["Recording"]):
         self._log_after_stamp_ns = probes[0].log_ns - self.start_ns
         self.duration_s = max((source.end_ns - probes[0].log_ns) / 1e9, 0.0) + (scans[0].end_ns - self.start_ns) / 1e9
         scan_times = [(probe.log_ns, scan.stamp_ns, scan.end_ns) for probe, scan in zip(probes, scans, strict=True)]
+        before: list[Scan | None] = [None, *scans[:-1]]
+        once = [t for t, scan, last in zip(scan_times, scans, before, strict=True) if not is_copy(scan, last)]
         self._clocks = Finding("clocks", "fine", "there is one only")
         self.preset = preset_for(lidar.type, probes[0])
         imu_findings = self._look_at_imu(np.array(scan_times, np.int64))
@@ -105,7 +107,7 @@ class Recording(AbstractContextManager["Recording"]):
             *source.findings,
             lidar_finding,
             imu_finding,
-            *overlap_finding(np.array(without_copies(scan_times, scans), np.int64), self.lidar_topic),
+            *overlap_finding(np.array(once, np.int64), self.lidar_topic),
             *probe_findings,
             *cloud_findings,
             *line_findings(scans, self.has_lines, params.sensor),

@@ -68,8 +68,8 @@ def stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def instead_of_times(stamps: list[int]) -> str:
-    """What headers carry that is no time of a message: the same for all, or whole seconds for several; "" if times."""
+def stamp_fault(stamps: list[int]) -> str:
+    """What headers carry instead of times: "no time" if all are the same, or "whole seconds only"; "" for times."""
     different = set(stamps)
     if len(different) < 2:
         return "no time"

@@ -197,15 +197,13 @@ def _header_by_delay(clouds: list[Probe], duration_ns: float) -> tuple[End, Find
     """The header's point, judged by how long after it the clouds were logged; without evidence, the last."""
     delay = log_delay_ns(clouds)
     if delay is None:
-        return _header(
-            "last", "the recording does not show it, and most drivers do so; if yours stamps the first:", "needs you"
-        )
+        return _header("last", "the recording does not show it; most drivers do so; if not:", "needs you")
     text = f"the clouds were logged {delay / 1e6:.0f} ms after it, and a scan takes {duration_ns / 1e6:.0f} ms"
     if delay < 0.5 * duration_ns:
         return _header("last", text, "corrected")
     if 0.9 * duration_ns < delay < 3 * duration_ns:
         return _header("first", text, "corrected")
-    return _header("last", f"{text}, which shows neither; most drivers do so; if yours stamps the first:", "needs you")
+    return _header("last", f"{text}, which shows neither; most drivers do so; if not:", "needs you")
 
 
 def _header(end: End, evidence: str, verdict: FindingVerdict) -> tuple[End, Finding]:

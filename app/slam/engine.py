@@ -61,8 +61,8 @@ class EngineState:
 
 
 ASTRAY_M = 2.0
-"""m: standard deviation of where odometry has led since scans showed little, if the first scan behind contradicts it: a
-speed wrong by 0.5 m/s for some seconds."""
+"""m: standard deviation of odometry's error once a scan has contradicted it, as after a stretch in which scans show
+little: a speed that was wrong by 0.5 m/s for four seconds."""
 _Fuse = Callable[[LocalMap, FilterParams], tuple[Belief, Registration]]
 
 

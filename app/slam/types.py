@@ -279,7 +279,7 @@ class Keyframe:
         cloud: in the LiDAR frame at `stamp_ns`.
         drift: (6, 6) what adds to it since the first keyframe.
         resumed_ns: when the scans went on, if it is the first after a pause (`app.slam.pause`); otherwise 0.
-        astray: m, standard deviation of what odometry may be off since the last keyframe, if a scan contradicted it;
+        astray: m, standard deviation by which odometry may be off since the last keyframe, if a scan contradicted it;
             otherwise 0.
     """
 

@@ -46,7 +46,7 @@ from tests.rounds import AS_LOOPS, walk_round
 SAMPLE = next((Path(__file__).resolve().parents[2] / "sample_data").glob("*.mcap"))
 FILES = ("trajectory.tum", "trajectory_odometry.tum", "loops.csv", "graph.g2o", "map.ply")
 LENGTH_S = 16.0
-"""As far as the sample's first loops, if so short ones count; the other recordings are shorter."""
+"""Long enough for the sample's first loops with AS_LOOPS; the other recordings are shorter."""
 SHORT = ("--duration", str(LENGTH_S), "--set", AS_LOOPS)
 ROOMS = ["perfect", "imperfect"]
 
@@ -118,7 +118,7 @@ def workbench(recording: Path) -> Workbench:
 def test_an_undisturbed_session_a_replay_and_a_run_write_the_same(
     recording: Path, workbench: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On the sample all three have a process for their loops; in rooms the page only, which saves four starts."""
+    """On the sample, all three look for loops in another process; in the rooms only the page does, to save time."""
     if recording != SAMPLE:
         monkeypatch.setattr("app.mapping.opening.open_session", partial(open_session, loops=InlineLoops))
     ended = workbench.do(Play())

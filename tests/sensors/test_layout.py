@@ -57,8 +57,8 @@ def test_a_header_at_the_last_point_is_noticed_because_the_cloud_was_logged_too_
     assert findings["header stamp"].option == "--set recording.header_stamp=first"
 
 
-def test_the_setting_of_a_decision_that_is_right_is_offered_only_in_case_it_is_wrong() -> None:
-    """Whoever types all that a report proposes must not undo what is right."""
+def test_a_correct_decision_offers_its_option_only_in_case_it_is_wrong() -> None:
+    """A user who applies every option of a report must not undo correct decisions."""
     right = Finding("header stamp", "fine", "of the first point", "--set recording.header_stamp=last")
     assert str(right) == "of the first point (if that is wrong: --set recording.header_stamp=last)"
     assert str(replace(right, verdict="needs you")) == "of the first point --set recording.header_stamp=last"

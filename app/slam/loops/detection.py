@@ -99,7 +99,7 @@ class Detector:
 
     @property
     def astray(self) -> F64:
-        """(k,) m, as of keyframes."""
+        """(k,) m, `Keyframe.astray` of each."""
         return self._astray[: len(self)]
 
     @property

@@ -121,8 +121,8 @@ def expect(
     """What the graph of poses (k, 4, 4) T_map_imu with these loops expects, seen from keyframe `root`.
 
     Args:
-        resumed: (k,) which keyframes are the first after a pause; None: there was none. astray: (k,) m, of each
-            keyframe.
+        resumed: (k,) which keyframes are the first after a pause; None: there was none. astray: (k,) m,
+            `Keyframe.astray` of each.
     """
     count, loops = len(poses), [loop for loop in loops if not loop.open]
     p = poses[:, :3, 3]

@@ -77,8 +77,8 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
 
     The filter gives the covariance of each pose in its map, which it takes as exact, not that of the step between them.
     So the covariances of both poses are added, as if they were independent (an upper bound), and drift is added as a
-    random walk: constant over `EVEN_M`, independent beyond. A step across a pause is a guess, one that a scan
-    contradicted nearly so.
+    random walk: constant over `EVEN_M`, independent beyond. A step across a pause is a guess. One that a scan
+    contradicted may be off by metres.
     """
     T = lie.inverse(before.T_odom_imu) @ after.T_odom_imu
     walked = float(np.linalg.norm(T[:3, 3]))
