@@ -17,6 +17,7 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import scan_context, slips, verification
 from app.slam.loops.drift import Expectation
 from app.slam.loops.scan_context import ScanContext
+from app.slam.loops.slips import Slip
 from app.slam.loops.submap import Submaps
 from app.slam.loops.types import LoopDetail
 from app.slam.loops.verification import Prepared
@@ -68,7 +69,7 @@ class Detector:
         self._around = lru_cache(KEPT_SUBMAPS)(lambda *key: self._submaps.around(key[0], self._poses, *key[1:]))
         self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
         self._pieces = lru_cache(KEPT_PIECES)(self._piece)
-        self._slips: dict[tuple[int, int], F64 | None] = {}
+        self._slips: dict[tuple[int, int], Slip | None] = {}
         self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
@@ -163,8 +164,8 @@ class Detector:
         end = next((k for k in after if self.slip(k) is not None), after.stop) - 1
         return self._prepared(index, first, end)
 
-    def slip(self, index: int) -> F64 | None:
-        """How far odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`.
+    def slip(self, index: int) -> Slip | None:
+        """How odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`.
 
         Not across a pause, where it is a guess.
         """

@@ -167,7 +167,7 @@ class Search:
         if index > 0 and self.start.enabled and (slip := self.detector.slip(index)) is not None:
             measured, after = self._measured[index], self.detector.poses[index]
             assert measured.odometry is not None
-            self._loose[index] = replace(measured, odometry=loosened(measured.odometry, slip, after[:3, :3]))
+            self._loose[index] = replace(measured, odometry=loosened(measured.odometry, slip.moved, after[:3, :3]))
 
     def _take(self, found: Found) -> None:
         self.detector.learn(found.contexts[self.detector.described - found.first :])
@@ -202,7 +202,7 @@ class Search:
         out: list[LoopEdge] = []
         for sighting in self.detector.look(newer, expectation, params):
             between = [index for index in self._loose if sighting.older < index <= newer]
-            broken = any(slips.is_break(self.detector.slip(index)) for index in between)
+            broken = any(slip.is_break for index in between if (slip := self.detector.slip(index)))
             out.append(judge(sighting, self.detector, expectation, params, broken=broken))
             if out[-1].verdict is Verdict.CANDIDATE and out[-1].evidence.gate_m < SURE_M:
                 break

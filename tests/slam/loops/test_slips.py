@@ -11,7 +11,7 @@ import pytest
 from app.slam import lie
 from app.slam.loops.detection import Detector
 from app.slam.loops.search import Search
-from app.slam.loops.slips import REACH, slip
+from app.slam.loops.slips import BREAK_M, REACH, slip
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Cloud, Keyframe
 from tests.slam.loops.test_verification import FINS, corridor, pose, seen
@@ -27,13 +27,28 @@ def test_between_surfaces_that_hold_every_slip_shows_as_large_as_it_is(moved: F6
     before = seen(corridor(np.random.default_rng(0), FINS), np.eye(4))
     found = slip(before, seen(corridor(np.random.default_rng(1), FINS), moved), np.eye(4))
     assert found is not None
-    np.testing.assert_allclose(found, np.concatenate([lie.log(moved[:3, :3]), moved[:3, 3]]), atol=0.02)
+    np.testing.assert_allclose(found.moved, np.concatenate([lie.log(moved[:3, :3]), moved[:3, 3]]), atol=0.02)
+    assert not found.is_break
     assert slip(before, seen(corridor(np.random.default_rng(1), FINS), np.eye(4)), np.eye(4)) is None
 
 
 def test_along_a_bare_corridor_no_slip_can_be_reported() -> None:
     before = seen(corridor(np.random.default_rng(0)), np.eye(4))
     assert slip(before, seen(corridor(np.random.default_rng(1)), pose(0.3, 0.0, 0.0, 0.0)), np.eye(4)) is None
+
+
+def test_a_slip_is_a_break_only_where_both_sides_coincide() -> None:
+    """Where the walk turns into another corridor, registration may slide as far, onto a few surfaces of the old one."""
+    before, turned, slid = (
+        seen(corridor(np.random.default_rng(0), FINS), np.eye(4)),
+        pose(0, 0, 0, 20),
+        pose(0, 0, 0, 70),
+    )
+    broken = slip(before, seen(corridor(np.random.default_rng(1), FINS), turned), np.eye(4))
+    assert broken is not None and broken.is_break
+    other = corridor(np.random.default_rng(1), (-4.0, -2.0, 1.0, 5.0), length=20.0) @ slid[:3, :3].T
+    found = slip(before, seen(other, np.eye(4)), np.eye(4))
+    assert found is not None and np.linalg.norm(found.moved[3:]) > BREAK_M and not found.is_break
 
 
 @pytest.fixture(scope="module")
