@@ -5,6 +5,7 @@ State on SO(3) x R3 x R3 x R3 x R3 x S² x SO(3) x R3, 23 error dimensions in th
 state's size and not by the number of points; each iteration is one Gauss-Newton step of eq. 7.
 """
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -85,7 +86,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     free = DIM if params.estimate_extrinsics else NAVIGATION
     information = np.asarray(np.linalg.inv(prior.covariance[:free, :free]))
     world, residuals = np.empty((n, 3)), np.empty(n)
-    H, b, stats = np.empty((12, 12)), np.empty(12), np.zeros(2)
+    H, b, stats = np.empty((6, 6)), np.empty(6), np.zeros(2)
     begin = x = _packed(prior.state)
     covariance, step = np.empty((free, free)), np.empty(DIM)
     planes: Planes | None = None
@@ -103,11 +104,11 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
             since_search[:] = 0.0
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
-            planes.deviations, params.gate, params.estimate_extrinsics, H, b, stats, residuals,
+            planes.deviations, params.gate, H, b, stats, residuals,
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
-        H, b = _nonnegative(H, b)
+        H, b = _nonnegative(H, b, points)
         here, x = x, np.empty(manifold.SIZE)
         manifold.gauss_newton(here, begin, information, H, b, covariance, step, x)
         since_search += step
@@ -120,7 +121,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     manifold.boxminus(x, begin, correction)
     correction = correction[:free]
     surprise = correction @ information @ correction / (free - np.trace(information @ covariance))
-    found = outcome(points, H[:6, :6], converged, iteration, stats, matches(points, residuals, planes))
+    found = outcome(points, H, converged, iteration, stats, matches(points, residuals, planes))
     posterior = schmidt(prior.covariance, information, covariance)
     return Belief(_unpacked(x, prior.state.stamp_ns), posterior), replace(found, surprise=float(surprise))
 
@@ -145,14 +146,23 @@ def is_imu_to_blame(registration: Registration) -> bool:
     return registration.surprise > SURPRISING and enough
 
 
-def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
+def _nonnegative(H: F64, b: F64, points: F32) -> tuple[F64, F64]:
     """Normal equations without the directions in which normals' errors explain more than all that the points tell."""
-    eigenvalues, axes = np.linalg.eigh(H)
-    if eigenvalues[0] > 0.0:
+    with contextlib.suppress(np.linalg.LinAlgError):
+        np.linalg.cholesky(H)  # faster than the eigenvalues
         return H, b
+    scale = _scale(points)
+    eigenvalues, axes = np.linalg.eigh(H * scale[:, None] * scale)
     told = axes[:, eigenvalues > 0.0]
-    kept = told @ told.T
-    return kept @ H @ kept, kept @ b
+    kept = scale[:, None] * (told @ told.T) / scale
+    return kept.T @ H @ kept, kept.T @ b
+
+
+def _scale(points: F32) -> F64:
+    """(6,) rad/m and 1: what turns errors in m into those of rotation and position. A rotation counts as far as it
+    moves points (n, 3) m at their RMS distance."""
+    reach = float(np.sqrt(np.square(points, dtype=np.float64).sum() / len(points)))
+    return np.array([1.0 / reach] * 3 + [1.0] * 3)
 
 
 def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:
@@ -172,9 +182,8 @@ def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, m
         points: (n, 3) m, LiDAR frame. H: (6, 6) information of the scan alone on rotation (rad) and position (m).
         stats: (2,) number of inliers, and the sum of their squared residuals in m².
     """
-    reach = float(np.sqrt(np.mean(np.sum(points.astype(np.float64) ** 2, axis=1))))
-    scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
-    eigenvalues = np.linalg.eigvalsh(H * np.outer(scale, scale))
+    scale = _scale(points)
+    eigenvalues = np.asarray(np.linalg.eigvalsh(H * scale[:, None] * scale), np.float64)
     degenerate = bool(eigenvalues[0] < 1.0 / DEGENERATE_SIGMA**2)
     reason = "this scan leaves one direction unobserved" if degenerate else ""
     rms = float(np.sqrt(stats[1] / stats[0]))

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from app.slam.kernels.small import rotation
+from app.slam.kernels.small import cross, rotation
 
 
 @njit(cache=True)
@@ -125,8 +125,8 @@ def gauss_newton(x, prior, information, H, b, covariance, step, out):
     """One step of eq. 7: minimise |x [-] prior|²_P + sum |z + H d|²_R, linearised at x.
 
     x, prior (SIZE,) f64: packed states. information (n, n): inverse prior covariance of the first n error
-    dimensions (17 without the extrinsics, 23 with them). H (12, 12), b (12,): normal equations of the points over
-    rotation, position and the extrinsics. Out: covariance (n, n), step (23,), the new state out (SIZE,).
+    dimensions (17 without the extrinsics, 23 with them). H (6, 6), b (6,): normal equations of the points over
+    rotation and position. Out: covariance (n, n), step (23,), the new state out (SIZE,).
     """
     n = len(information)
     d = np.empty(23)
@@ -136,13 +136,16 @@ def gauss_newton(x, prior, information, H, b, covariance, step, out):
     J[15:17, 15:17] = tangent_basis(prior[21:24]).T @ tangent_basis(x[21:24])
     if n > 17:
         J[17:20, 17:20] = right_jacobian_inverse(d[17:20])
-    A = J.T @ information @ J
-    r = J.T @ (information @ d[:n])
-    for i in range(12 if n > 17 else 6):
-        row = i if i < 6 else i + 11
-        r[row] += b[i]
-        for j in range(12 if n > 17 else 6):
-            A[row, j if j < 6 else j + 11] += H[i, j]
+    to_pose = np.eye(6, n)
+    if n > 17:  # an error of the extrinsics moves the points as an error of the pose does
+        R, R_il = x[0:9].reshape(3, 3), x[24:33].reshape(3, 3)
+        to_pose[0:3, 17:20], to_pose[3:6, 20:23] = R_il, R
+        lever = np.empty(3)
+        for i in range(3):
+            cross(x[33:36], R_il[:, i], lever)
+            to_pose[3:6, 17 + i] = R @ lever
+    A = J.T @ information @ J + to_pose.T @ H @ to_pose
+    r = J.T @ (information @ d[:n]) + to_pose.T @ b
     inverse = np.linalg.inv(A)
     covariance[:] = 0.5 * (inverse + inverse.T)
     step[:] = 0.0

@@ -28,50 +28,41 @@ def to_world(points, R, p, R_il, p_il, out):
 
 
 @njit(cache=True, inline="always")
-def _differentiate(nx, ny, nz, R, R_il, ix, iy, iz, x, y, z, row):
-    """Fill row (12,) with the derivatives of a point's distance along n (odom); returns n in the LiDAR frame."""
-    ax = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz  # R^T n: the normal in the IMU frame
+def _differentiate(nx, ny, nz, R, ix, iy, iz, row):
+    """Fill row (6,) with the derivatives of a point's distance along n (odom); returns n in the IMU frame."""
+    ax = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
     ay = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
     az = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
-    lx = R_il[0, 0] * ax + R_il[1, 0] * ay + R_il[2, 0] * az
-    ly = R_il[0, 1] * ax + R_il[1, 1] * ay + R_il[2, 1] * az
-    lz = R_il[0, 2] * ax + R_il[1, 2] * ay + R_il[2, 2] * az
     row[0], row[1], row[2] = iy * az - iz * ay, iz * ax - ix * az, ix * ay - iy * ax
     row[3], row[4], row[5] = nx, ny, nz
-    row[6], row[7], row[8] = y * lz - z * ly, z * lx - x * lz, x * ly - y * lx
-    row[9], row[10], row[11] = ax, ay, az
-    return lx, ly, lz
+    return ax, ay, az
 
 
 @njit(cache=True, inline="always")
-def _add(w, d, row, columns, H, b):
+def _add(w, d, row, H, b):
     """Add a distance d of weight w to the upper half of H and to b."""
-    for i in range(columns):
+    for i in range(6):
         wi = w * row[i]
         b[i] += wi * d
-        for k in range(i, columns):
+        for k in range(i, 6):
             H[i, k] += wi * row[k]
 
 
 @njit(cache=True)
-def normal_equations(
-    points, R, p, R_il, p_il, normals, centers, variances, deviations, gate, extrinsics, H, b, stats, residuals
-):
+def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, deviations, gate, H, b, stats, residuals):
     """Accumulate H^T W H and H^T W z of eq. 5-6 over all points with a plane.
 
     A normal has errors of its own. Their squares would count as information, mostly along a corridor, where there is
     little other, and would pull each point towards the middle of its patch. What they add on average is subtracted
     (Fuller 1987, "Measurement Error Models"), so H may have negative eigenvalues.
 
-    Columns: rotation (right perturbation), position, extrinsic rotation, extrinsic translation; the last two are zero
-    unless `extrinsics`. points (n, 3) f32 m, LiDAR frame; R, p: pose of the IMU in odom; R_il, p_il: pose of the LiDAR
-    in the IMU frame; normals, centers (n, 3), variances (n,) m², deviations (n, 2, 3) rad: planes as from
-    `kernels.map.planes`; gate m/√m. Out: H (12, 12), b (12,), stats (2,): inliers and their sum of squared distances in
-    m²; residuals (n,) m, signed, nan if not used.
+    Columns: rotation (right perturbation) and position. points (n, 3) f32 m, LiDAR frame; R, p: pose of the IMU in
+    odom; R_il, p_il: pose of the LiDAR in the IMU frame; normals, centers (n, 3), variances (n,) m², deviations
+    (n, 2, 3) rad: planes as from `kernels.map.planes`; gate m/√m. Out: H (6, 6), b (6,), stats (2,): inliers and their
+    sum of squared distances in m²; residuals (n,) m, signed, nan if not used.
     """
     H[:], b[:], stats[:] = 0.0, 0.0, 0.0
-    row = np.empty(12)
-    columns = 12 if extrinsics else 6
+    row = np.empty(6)
     for j in range(len(points)):
         residuals[j] = np.nan
         if variances[j] < 0.0:
@@ -89,8 +80,8 @@ def normal_equations(
         reach = math.sqrt(x * x + y * y + z * z)
         if abs(d) > gate * math.sqrt(reach):
             continue
-        lx, ly, lz = _differentiate(nx, ny, nz, R, R_il, ix, iy, iz, x, y, z, row)
-        if abs(lx * x + ly * y + lz * z) < EDGE_ON * reach:
+        ax, ay, az = _differentiate(nx, ny, nz, R, ix, iy, iz, row)
+        if abs(ax * (ix - p_il[0]) + ay * (iy - p_il[1]) + az * (iz - p_il[2])) < EDGE_ON * reach:
             continue
         w = 1.0 / (REPEATED * variances[j])
         if d * d > RESIDUAL_HUBER * RESIDUAL_HUBER * variances[j]:
@@ -98,11 +89,11 @@ def normal_equations(
         residuals[j] = d
         stats[0] += 1.0
         stats[1] += d * d
-        _add(w, d, row, columns, H, b)
+        _add(w, d, row, H, b)
         for m in range(2):
             nx, ny, nz = deviations[j, m, 0], deviations[j, m, 1], deviations[j, m, 2]
-            _differentiate(nx, ny, nz, R, R_il, ix, iy, iz, x, y, z, row)
-            _add(-w, nx * ox + ny * oy + nz * oz, row, columns, H, b)
-    for i in range(12):
+            _differentiate(nx, ny, nz, R, ix, iy, iz, row)
+            _add(-w, nx * ox + ny * oy + nz * oz, row, H, b)
+    for i in range(6):
         for k in range(i):
             H[i, k] = H[k, i]
