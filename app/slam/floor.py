@@ -17,7 +17,6 @@ from app.slam.sections import GroundParams
 
 HALF = 5
 """Scans in each half of the last scans. When the newer half is full, the older one is dropped."""
-_NOTHING = np.array([0.0, 0.0, np.inf, -np.inf], np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,24 +41,15 @@ class Floor:
     @classmethod
     def unknown(cls, T_odom_lidar: F64) -> Self:
         """Around this pose, before any scan."""
-        seen = np.tile(_NOTHING, (2, CELLS, CELLS, 1))
+        seen = np.tile(kernels.NOTHING, (2, CELLS, CELLS, 1))
         found = np.full((CELLS, CELLS), np.nan, np.float32)
         return cls(T_odom_lidar, _corner(T_odom_lidar), 0, seen, np.zeros((CELLS, CELLS, 2), np.float32), found)
 
     def with_scan(self, points: F32, ring: U16, T_odom_lidar: F64, params: GroundParams) -> Self:
         """The floor with one more scan: points (n, 3) m, LiDAR frame, and their lines (n,), 0 the lowest."""
-        before, known = self.known.copy(), np.empty_like(self.known)
-        kernels.remember(self.seen, self.found, before)
-        corner = _corner(T_odom_lidar)
-        by = corner - self.corner
-        _move(before, by, np.zeros(2), known)
-        seen = np.empty_like(self.seen)
-        if self.scans % HALF:
-            _move(self.seen[0], by, _NOTHING, seen[0])
-            _move(self.seen[1], by, _NOTHING, seen[1])
-        else:
-            seen[0] = _NOTHING
-            _move(self.seen[0], by, _NOTHING, seen[1])
+        seen, known, corner = np.empty_like(self.seen), np.empty_like(self.known), _corner(T_odom_lidar)
+        full = self.scans % HALF == 0
+        kernels.remember(self.seen, self.found, self.known, corner - self.corner, full, seen, known)
         p = T_odom_lidar[:3, 3]
         kernels.see(points, ring, last_line(ring, params.scan_lines), T_odom_lidar[:3, :3], p, corner, seen[0])
         return replace(self, T_odom_lidar=T_odom_lidar, corner=corner, scans=self.scans + 1, seen=seen, known=known)
@@ -87,13 +77,3 @@ class Floor:
 def _corner(T_odom_lidar: F64) -> I64:
     """(2,) index of the first cell of the square around this pose."""
     return np.floor(T_odom_lidar[:2, 3] / EDGE_M).astype(np.int64) - CELLS // 2
-
-
-def _move(cells: F32, by: I64, nothing: F64 | F32, out: F32) -> None:
-    """Fill `out` with the cells of a square that lies `by` (2,) cells farther; `nothing` where they are new."""
-    if by.any():
-        out[:] = nothing
-    (i, j), (m, n) = np.maximum(by, 0), CELLS - np.abs(by)
-    if min(m, n) > 0:
-        a, b = np.maximum(-by, 0)
-        out[a : a + m, b : b + n] = cells[i : i + m, j : j + n]

@@ -9,6 +9,8 @@ CELLS, EDGE_M = 128, 0.5
 """Cells along each side of the square, and the length of a cell's edge."""
 COUNT, MEAN, LOWEST, HIGHEST = range(4)
 """Of the heights (m, odometry's frame) that scans show in a cell. Mean and count are of points on the lowest lines."""
+NOTHING = np.array([0.0, 0.0, np.inf, -np.inf], np.float32)
+"""Of a cell that no scan shows."""
 NONE, BESIDE, FLOOR, PLANE = range(4)
 """What a cell is: nothing, beside the floor, floor, or floor on its plane."""
 _HEAD_M = 0.5
@@ -44,22 +46,28 @@ def see(points, ring, last, R, p, corner, seen):
 
 
 @njit(cache=True, nogil=True)
-def remember(seen, found, known):
+def remember(seen, found, known, by, full, now_seen, now_known):
     """Keep the heights of cells that were found to be the floor, and forget those that scans contradict.
 
-    seen (2, CELLS, CELLS, 4) f32; found (CELLS, CELLS) f32 m, nan where there is no floor. In and out: known (CELLS,
-    CELLS, 2) f32: m, and the number of scans that it is the mean of, 0 where it is not known.
+    seen (2, CELLS, CELLS, 4) f32; found (CELLS, CELLS) f32 m, nan where there is no floor; known (CELLS, CELLS, 2) f32:
+    m, and the number of scans that it is the mean of, 0 where it is not known. Out: now_seen, now_known: the same for
+    the square that lies `by` (2,) cells farther; if the newer half of `seen` is `full`, it is the older one there.
     """
     for i in range(CELLS):
         for j in range(CELLS):
-            if known[i, j, 1] == 0 and np.isnan(found[i, j]):
+            u, v, cell = i + by[0], j + by[1], now_known[i, j]
+            inside = 0 <= u < CELLS and 0 <= v < CELLS
+            for c in range(4):
+                now_seen[0, i, j, c] = seen[0, u, v, c] if inside and not full else NOTHING[c]
+                now_seen[1, i, j, c] = seen[0 if full else 1, u, v, c] if inside else NOTHING[c]
+            cell[0], cell[1] = (known[u, v, 0], known[u, v, 1]) if inside else (0.0, 0.0)
+            if not inside or (cell[1] == 0 and np.isnan(found[u, v])):
                 continue
-            count, mean, lowest, highest = _both(seen, i, j)
+            count, mean, lowest, highest = _both(seen, u, v)
             flat = count >= _LEAST_POINTS and highest - lowest < _FLAT_M
-            cell = known[i, j]
             if cell[1] and (lowest < cell[0] - _RISE_M or (flat and abs(mean - cell[0]) > _RISE_M)):
                 cell[1] = 0
-            elif flat and abs(mean - found[i, j]) < _RISE_M:
+            elif flat and abs(mean - found[u, v]) < _RISE_M:
                 cell[1] = min(cell[1] + 1, _MOST_SCANS)
                 cell[0] = mean if cell[1] == 1 else cell[0] + (mean - cell[0]) / cell[1]
 
