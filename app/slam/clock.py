@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.slam import lie
+from app.slam.kernels import manifold
 from app.slam.types import F64, ImuSamples, NavState
 
 USUAL_S = 5e-3
@@ -48,7 +48,7 @@ class ClockOffset:
     def learnt(self, samples: ImuSamples, predicted: NavState, posterior: NavState) -> "ClockOffset":
         """This estimate, updated with a frame: its samples, the state predicted from them, and that after its scan."""
         rate = np.asarray(samples.gyro.mean(axis=0))
-        correction = lie.log(predicted.R_odom_imu.T @ posterior.R_odom_imu)
+        correction = manifold.log(predicted.R_odom_imu.T @ posterior.R_odom_imu)
         change = rate - (rate if self.rate is None else self.rate)
         if not (np.abs(correction).max() <= LARGEST_TURN and np.abs(change).max() <= LARGEST_CHANGE):
             return replace(self, rate=rate)

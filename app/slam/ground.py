@@ -100,7 +100,8 @@ def _on_floor(points: F32, ring: U16, params: GroundParams, none: GroundResult) 
     none = replace(none, floor=floor)
     if not len(cells):
         return replace(none, reason="no seeds: no flat ground is seen around the scanner")
-    result = _plane(none, cells.mean(axis=0), np.cov(cells.T, bias=True), params)
+    mean = cells.mean(axis=0)
+    result = _plane(none, mean, (cells - mean).T @ (cells - mean) / len(cells), params)
     if not result.found:
         return result
     count = floor.label(points, ring, kinds, params, none.labels)

@@ -44,7 +44,7 @@ class Planes:
     """Planes through the neighbourhoods of n query points.
 
     Attributes:
-        normals: (n, 3) unit. centers: (n, 3) m, odom.
+        normals: (n, 3) unit. centers: (n, 3) m, odom. Both are zeros where there is no plane.
         variances: (n,) m², of a point's distance from its plane; negative where there is no plane.
         deviations: (n, 2, 3) rad, two vectors whose outer products sum to the normal's covariance.
     """
@@ -115,7 +115,7 @@ class LocalMap:
         The normal of a poor one may be RELAXED times as uncertain as that of a good one.
         """
         n = len(queries)
-        normals, centers, variances = np.empty((2, n, 3)), np.zeros((2, n, 3)), np.empty((2, n))
+        normals, centers, variances = np.zeros((2, n, 3)), np.zeros((2, n, 3)), np.empty((2, n))
         deviations = np.empty((2, n, 2, 3))
         reach, tilt = min(params.neighbour_distance, self._voxel), math.radians(params.plane_tilt)
         tilts, old = np.array([RELAXED * tilt, tilt]), self._way[3] - OLD_M**2

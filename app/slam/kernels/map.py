@@ -202,7 +202,7 @@ def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, places, room, sp
 def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, normals, centers, variances, deviations):
     """Planes through the nearest of n ranked points around (x, y, z), one for each of `tilts` (see `planes`).
 
-    Out, in row j of each tilt: normals, unit; centers, m, relative to the query; variances, m² or -1; deviations, rad.
+    Out, in row j of each tilt: normals, unit; centers, m; variances, m² or -1; deviations, rad.
     Scratch: normal.
     """
     variances[:, j] = -1.0
@@ -240,7 +240,7 @@ def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, n
             doubt = max(1.0, scatter / (SURE_TILT * SURE_TILT * take * l2))
             for i in range(begin, level):
                 normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = normal[0], normal[1], normal[2]
-                centers[i, j, 0], centers[i, j, 1], centers[i, j, 2] = mx, my, mz
+                centers[i, j, 0], centers[i, j, 1], centers[i, j, 2] = mx + x, my + y, mz + z
                 variances[i, j] = (noise * noise + SHARED * l3) * doubt
                 _deviate(
                     xx * s - mx * mx, xy * s - mx * my, xz * s - mx * mz, yy * s - my * my, yz * s - my * mz,
@@ -333,7 +333,3 @@ def planes(
             )  # fmt: skip
             for i in range(len(tilts)):
                 variances[i, j] *= OLD
-        for i in range(len(tilts)):
-            centers[i, j, 0] += x
-            centers[i, j, 1] += y
-            centers[i, j, 2] += z
