@@ -194,11 +194,7 @@ def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, m
 
 def matches(points: F32, residuals: F64, planes: Planes) -> Matches:
     """By point, what was looked up."""
-    found = planes.variances[:, None] >= 0.0  # elsewhere normals and centers were never written
-    normals, centers = np.where(found, planes.normals, 0.0), np.where(found, planes.centers, 0.0)
-    found_at = Matches(
-        points.copy(), residuals.astype(np.float32), normals.astype(np.float32), centers.astype(np.float32)
-    )
+    found_at = Matches(points.copy(), *(a.astype(np.float32) for a in (residuals, planes.normals, planes.centers)))
     for array in (found_at.points, found_at.residuals, found_at.normals, found_at.centers):
         array.setflags(write=False)
     return found_at
