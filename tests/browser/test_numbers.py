@@ -60,7 +60,10 @@ def test_a_number_is_taken_when_its_box_is_left_with_all_its_digits(bench: Bench
             type_over(bench, boxes(bench, name), str(value))
             bench.page.keyboard.press("Tab")
         bench.eventually(lambda values=values: values in set_params(bench)[-1].values())
-        bench.page.wait_for_timeout(1500)
+        bench.engine.send(StepFrame())  # what the page shows of it comes after its answer to the numbers
+        frame = bench.engine.snapshot.transport.frame
+        expect(bench.page.get_by_text(f"frame {frame} of 0–399")).to_be_visible()
+        bench.page.wait_for_timeout(300)  # three frames
         assert [float(boxes(bench, name).input_value()) for name in names] == list(values)
     bench.page.get_by_text("Sensor", exact=True).click()
 
