@@ -7,7 +7,7 @@ import numpy as np
 
 from app.slam import channels, ground, iekf, imu, lie, moving, start
 from app.slam.engine import Engine
-from app.slam.kernels import clouds
+from app.slam.kernels import clouds, manifold
 from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap
 from app.slam.params import Params
@@ -47,6 +47,7 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     progress("registration", 0.35)
     posterior, _ = iekf.update(predicted, points, local_map, params.filter)
     iekf.boxminus(posterior.state, predicted.state)
+    manifold.log(np.eye(3))
     lie.log(np.eye(3))
     LineErrors.unknown().learnt(posterior, points, scan.ring, 1.0, local_map, params.filter)
     progress("a whole frame", 0.9)
