@@ -23,7 +23,7 @@ run: install ## Open the workbench on RECORDING; by default the one in sample_da
 install: $(VENV)/.installed ## Install what is needed to run into .venv/.
 
 test: $(VENV)/.installed-dev ## Run the tests.
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.installed-dev ## Check format, lint, types and the direction of imports.
 	$(BIN)/ruff format --check .
