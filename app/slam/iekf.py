@@ -108,7 +108,7 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
         )  # fmt: skip
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
-        H, b = _nonnegative(H, b, points)
+        H, b = _nonnegative(H, b)
         here, x = x, np.empty(manifold.SIZE)
         manifold.gauss_newton(here, begin, information, H, b, covariance, step, x)
         since_search += step
@@ -146,23 +146,15 @@ def is_imu_to_blame(registration: Registration) -> bool:
     return registration.surprise > SURPRISING and enough
 
 
-def _nonnegative(H: F64, b: F64, points: F32) -> tuple[F64, F64]:
+def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
     """Normal equations without the directions in which normals' errors explain more than all that the points tell."""
     with contextlib.suppress(np.linalg.LinAlgError):
         np.linalg.cholesky(H)  # faster than the eigenvalues
         return H, b
-    scale = _scale(points)
-    eigenvalues, axes = np.linalg.eigh(H * scale[:, None] * scale)
+    eigenvalues, axes = np.linalg.eigh(H)
     told = axes[:, eigenvalues > 0.0]
-    kept = scale[:, None] * (told @ told.T) / scale
-    return kept.T @ H @ kept, kept.T @ b
-
-
-def _scale(points: F32) -> F64:
-    """(6,) rad/m and 1: what turns errors in m into those of rotation and position. A rotation counts as far as it
-    moves points (n, 3) m at their RMS distance."""
-    reach = float(np.sqrt(np.square(points, dtype=np.float64).sum() / len(points)))
-    return np.array([1.0 / reach] * 3 + [1.0] * 3)
+    kept = told @ told.T
+    return kept @ H @ kept, kept @ b
 
 
 def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:
@@ -182,8 +174,9 @@ def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, m
         points: (n, 3) m, LiDAR frame. H: (6, 6) information of the scan alone on rotation (rad) and position (m).
         stats: (2,) number of inliers, and the sum of their squared residuals in m².
     """
-    scale = _scale(points)
-    eigenvalues = np.asarray(np.linalg.eigvalsh(H * scale[:, None] * scale), np.float64)
+    reach = float(np.sqrt(np.square(points, dtype=np.float64).sum() / len(points)))
+    scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
+    eigenvalues = np.linalg.eigvalsh(H * np.outer(scale, scale))
     degenerate = bool(eigenvalues[0] < 1.0 / DEGENERATE_SIGMA**2)
     reason = "this scan leaves one direction unobserved" if degenerate else ""
     rms = float(np.sqrt(stats[1] / stats[0]))
