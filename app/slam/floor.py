@@ -49,7 +49,7 @@ class Floor:
         """The floor with one more scan: points (n, 3) m, LiDAR frame, and their lines (n,), 0 the lowest."""
         seen, known, corner = np.empty_like(self.seen), np.empty_like(self.known), _corner(T_odom_lidar)
         full = self.scans % HALF == 0
-        kernels.remember(self.seen, self.found, self.known, corner - self.corner, full, seen, known)
+        kernels.carry(self.seen, self.found, self.known, corner - self.corner, full, seen, known)
         p = T_odom_lidar[:3, 3]
         kernels.see(points, ring, last_line(ring, params.scan_lines), T_odom_lidar[:3, :3], p, corner, seen[0])
         return replace(self, T_odom_lidar=T_odom_lidar, corner=corner, scans=self.scans + 1, seen=seen, known=known)

@@ -149,7 +149,7 @@ def is_imu_to_blame(registration: Registration) -> bool:
 def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
     """Normal equations without the directions in which normals' errors explain more than all that the points tell."""
     with contextlib.suppress(np.linalg.LinAlgError):
-        np.linalg.cholesky(H)  # faster than the eigenvalues
+        np.linalg.cholesky(H)  # raises if there is one; faster than the eigenvalues
         return H, b
     eigenvalues, axes = np.linalg.eigh(H)
     told = axes[:, eigenvalues > 0.0]

@@ -46,12 +46,15 @@ def see(points, ring, last, R, p, corner, seen):
 
 
 @njit(cache=True, nogil=True)
-def remember(seen, found, known, by, full, now_seen, now_known):
-    """Keep the heights of cells that were found to be the floor, and forget those that scans contradict.
+def carry(seen, found, known, by, full, now_seen, now_known):
+    """Carry what cells hold to the square around the next scan.
+
+    Heights of cells that were found to be the floor are kept, and those that scans contradict are forgotten.
 
     seen (2, CELLS, CELLS, 4) f32; found (CELLS, CELLS) f32 m, nan where there is no floor; known (CELLS, CELLS, 2) f32:
-    m, and the number of scans that it is the mean of, 0 where it is not known. Out: now_seen, now_known: the same for
-    the square that lies `by` (2,) cells farther; if the newer half of `seen` is `full`, it is the older one there.
+    m, and the number of scans that it is the mean of, 0 where it is not known; by (2,): cells to the next square;
+    full: whether the newer half of `seen` is full, becomes the older one, and a new one begins. Out: now_seen,
+    now_known: of the next square.
     """
     for i in range(CELLS):
         for j in range(CELLS):
@@ -80,7 +83,7 @@ def find(seen, known, corner, p, sigma, cos_slope, heights, kinds, seeds):
     known, less steep than the slope, the one counts that most cells lie on and fewest below. Cells on it are floor,
     and so are their neighbours at about the same height, and theirs. A cell beside the floor may be its edge.
 
-    Arguments as `see` and `remember`; sigma m/m; cos_slope of the steepest plane. Out: heights (CELLS, CELLS) f32 m,
+    Arguments as `see` and `carry`; sigma m/m; cos_slope of the steepest plane. Out: heights (CELLS, CELLS) f32 m,
     nan where there is no floor; kinds (CELLS, CELLS) u8, NONE to PLANE; seeds (CELLS², 3) f64 m, from the LiDAR,
     odometry's axes: cells on the plane. Returns the number of seeds.
     """

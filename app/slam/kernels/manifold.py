@@ -126,7 +126,8 @@ def gauss_newton(x, prior, information, H, b, covariance, step, out):
 
     x, prior (SIZE,) f64: packed states. information (n, n): inverse prior covariance of the first n error
     dimensions (17 without the extrinsics, 23 with them). H (6, 6), b (6,): normal equations of the points over
-    rotation and position. Out: covariance (n, n), step (23,), the new state out (SIZE,).
+    rotation and position, from which those over the extrinsics follow. Out: covariance (n, n), step (23,), the new
+    state out (SIZE,).
     """
     n = len(information)
     d = np.empty(23)

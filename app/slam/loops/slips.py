@@ -21,7 +21,7 @@ FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.25)
 BREAK_M, BREAK_RAD = 1.0, np.radians(15.0)
 """A slip larger than this may be a break. Odometry that drifts a lot slips at every step, but by less."""
 BREAK_OVERLAP = 0.3
-"""Least overlap at a break: registration is believed over odometry only where it would be believed of a loop."""
+"""Least overlap at a break; loops need the same (`loops.min_overlap`)."""
 LIKELY = 2.5
 """Largest deviation, in standard deviations, at which odometry still counts as right."""
 
