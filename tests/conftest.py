@@ -2,9 +2,11 @@
 
 import gc
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 # Before numpy is loaded: threads that share a core with another process of the tests wait for each other. That results
 # do not depend on their number is tested in slam/test_engine_repeats.py and recordings/test_odometry.py.
@@ -27,9 +29,26 @@ settings.register_profile("hemislam", deadline=None, derandomize=True, max_examp
 settings.load_profile("hemislam")
 
 
+COMPILE = """
+from app.slam.loops.service import warm_up
+from app.slam.warmup import compile_kernels
+compile_kernels()
+warm_up()
+"""
+compiling = pytest.StashKey[subprocess.Popen[bytes]]()
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Not in pyproject.toml, since naming it imports numba, which must come after what `app` settles for it."""
+    # Not in pyproject.toml, since naming it imports numba, which must come after what `app` settles for it.
     config.addinivalue_line("filterwarnings", "error::numba.core.errors.NumbaWarning")
+    if not hasattr(config, "workerinput") and config.getoption("numprocesses", None):
+        config.stash[compiling] = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=config.rootpath)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any) -> None:
+    """Tests begin once the kernels are compiled: else the workers would do it at the same time, each for itself."""
+    node.config.stash[compiling].wait()
 
 
 def pytest_collection_finish() -> None:
