@@ -1,17 +1,15 @@
 """The engine: one frame in, one result out. Synchronous and deterministic."""
 
-import contextlib
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
-from app.slam import channels, coast, ground, iekf, imu, keyframes, pause, rest, start
+from app.slam import channels, coast, ground, iekf, imu, keyframes, pause, start
 from app.slam.certainty import Certainty
 from app.slam.clock import ClockOffset
 from app.slam.floor import Floor
+from app.slam.fusion import NOT_REGISTERED, Fused, fuse
 from app.slam.imu import POS, Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
@@ -19,9 +17,24 @@ from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
 from app.slam.pause import Interruption
-from app.slam.sections import FilterParams
-from app.slam.types import F64, STAGES, Cloud, FrameStatus, ImuSamples, Keyframe, Registration, Scan, StepResult
-from app.slam.voxel import VoxelGrid, spread
+from app.slam.prediction import predict
+from app.slam.sections import SensorParams
+from app.slam.types import (
+    F32,
+    F64,
+    STAGES,
+    U8,
+    U16,
+    Cloud,
+    FrameStatus,
+    ImuSamples,
+    Keyframe,
+    NavState,
+    Registration,
+    Scan,
+    StepResult,
+)  # fmt: skip
+from app.slam.voxel import VoxelGrid
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +73,27 @@ class EngineState:
     keyframes: int
 
 
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """From where a scan is predicted.
+
+    Attributes:
+        belief: before the scan; while waiting, at its end. samples: those that lead from there to the scan's end.
+        still, waiting: as `start.Started`. floor, paused: as in `EngineProgress`. notice: for the user; "" if none.
+    """
+
+    belief: Belief
+    samples: ImuSamples
+    floor: Floor | None
+    paused: Interruption | None = None
+    still: ImuSamples | None = None
+    waiting: bool = False
+    notice: str = ""
+
+
 ASTRAY_M = 2.0
 """m: standard deviation of odometry's error once a scan has contradicted it, as after a stretch in which scans show
 little: a speed that was wrong by 0.5 m/s for four seconds."""
-_Fuse = Callable[[LocalMap, FilterParams], tuple[Belief, Registration]]
 
 
 class Engine:
@@ -94,113 +124,53 @@ class Engine:
         Without any samples the velocities are taken to be constant.
         """
         p, before, watch = self.params, self._progress, _Stopwatch()
-        end_ns, notices = scan.end_ns, []
-        scan = _in_range(channels.corrected(scan, p.sensor), p.sensor.min_range, p.sensor.max_range)
+        end_ns = scan.end_ns
         lines = before.lines if p.filter.learn_lines else LineErrors.unknown()
-        if lines.errors.any():
-            scan = channels.bent(scan, -lines.errors[:, 1], -lines.errors[:, 0])
         clock = before.clock if p.imu.learn_clock else ClockOffset()
+        scan = lines.set_right(_in_range(channels.corrected(scan, p.sensor), p.sensor))
         samples = clock.set_right(samples)
-        silent_s = imu.longest_gap(samples, end_ns)
-        if before.belief is not None and (paused := pause.before(scan, samples, before.belief.state.stamp_ns)):
-            resumed, samples = pause.resumed(before.belief, paused, scan, samples, p)
-            before = replace(before, belief=resumed, floor=None, paused=paused)
-            self._map.clear()
-            notices.append(
-                f"There are neither scans nor IMU samples for {paused.seconds:.1f} s. The map begins anew; loops tie "
-                "it to what was mapped before."
-            )
-        gapless = imu.longest_gap(samples, end_ns) <= p.imu.max_gap
-
-        belief, still, waiting = before.belief, before.still, False
-        if belief is None and not len(samples):
-            belief = coast.begin(scan, p)
-            notices.append("There is no IMU: motion is estimated from the LiDAR alone, less accurately.")
-        elif belief is None:
-            started = start.proceed(still, scan, samples, p)
-            belief, still, waiting = started.belief, started.still, started.waiting and gapless
-            notices += [started.notice] if started.notice else []
-        if len(samples):
-            before_scan = belief if gapless else imu.before_gap(belief)
-            predicted, path = imu.propagate(before_scan, samples, end_ns, p.imu, clock.sigma)
-            unsure = coast.is_unsure(predicted)
-            predicted = rest.hold(predicted, samples) if gapless and not unsure else predicted
-            watch.lap("propagate")
-            points = imu.deskew(scan, path, predicted.state)
-            course = coast.Course.measured(path, predicted.state) if not gapless or unsure else None
-        else:
-            course = coast.Course.steady(belief.state.stamp_ns, end_ns)
-            predicted = coast.propagate(belief, end_ns, course)
-            watch.lap("propagate")
-            points = coast.deskew(scan, predicted.state, course)
+        begun = self._begin(scan, samples, end_ns)
+        motion = predict(begun.belief, begun.samples, end_ns, p.imu, clock.sigma)
+        watch.lap("propagate")
+        points = motion.deskew(scan)
         watch.lap("deskew")
 
         # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
-        down, T_odom_lidar = _down_in_lidar(predicted), predicted.state.T_odom_lidar
-        surface = ground.segment(points, scan.ring, down, p.ground, before.floor, T_odom_lidar)
+        predicted = motion.belief.state
+        down = _down_in_lidar(predicted)
+        surface = ground.segment(points, scan.ring, down, p.ground, begun.floor, predicted.T_odom_lidar)
         watch.lap("ground")
         reduced = self._grid.downsample(points, p.ground.voxel_size, chosen=surface.labels)
         sampled = self._grid.downsample(reduced.points, p.scan.voxel_size)
         watch.lap("downsample")
 
         # paper 2.3, eq. 5-7
-        posterior, registration, adrift, contradicted = predicted, _NOT_REGISTERED, False, before.contradicted
-        if self._map.voxels:
-            if course is None:
-                chosen = spread(sampled.points, p.filter.max_points, p.scan.voxel_size)
-                fuse = partial(iekf.update, predicted, chosen)
-                posterior, registration = self._update(belief, predicted, fuse)
-                if registration.surprise > iekf.SURPRISING:  # once more, as if nothing were known of the speed
-                    contradicted = True
-                    open_speed = imu.with_open_speed(predicted, (end_ns - belief.state.stamp_ns) * 1e-9)
-                    posterior, _ = self._update(belief, predicted, partial(iekf.update, open_speed, chosen))
-            else:  # the points themselves, since centroids have no time
-                source, refines = reduced.source[sampled.source], p.filter.estimate_extrinsics and gapless
-                fuse = partial(coast.update, predicted, scan.part(source), course, extrinsics=refines)
-                posterior, registration = self._update(belief, predicted, fuse)
-                points = coast.deskew(scan, posterior.state, course)
-                sampled = replace(sampled, points=points[source])
-                # the prediction was no measurement that the scan could contradict
-                registration = replace(registration, predicted_change=np.nan, correction=np.nan)
-                blind = not len(samples) or not gapless
-                if blind and registration.degenerate and coast.is_adrift(posterior):
-                    adrift, why = True, "the IMU is silent" if len(samples) else "there is no IMU"
-                    registration = replace(registration, reason=f"{registration.reason}, and {why}")
-        posterior = posterior if gapless else imu.after_gap(posterior, belief)
-        if iekf.is_imu_to_blame(registration):
-            posterior = imu.with_open_biases(posterior)
-        status = FrameStatus.LOST if adrift else _status(waiting, self._map.voxels > 0, registration)
+        fused = fuse(motion, scan, points, sampled.points, reduced.source[sampled.source], self._map, p)
+        status = _status(fused, waiting=begun.waiting)
         watch.lap("update")
 
-        if registration.inliers and status is FrameStatus.TRACKING and len(samples) and gapless and p.imu.learn_clock:
-            clock = clock.learnt(samples, predicted.state, posterior.state)
-        paused = before.paused
+        posterior, paused = fused.belief, begun.paused
+        if status is FrameStatus.TRACKING and fused.registration.inliers and motion.covered and p.imu.learn_clock:
+            clock = clock.learnt(begun.samples, predicted, posterior.state)
         settling = paused is not None and not pause.is_over(paused, end_ns)
         if paused is not None and not settling:
             posterior = pause.levelled(posterior)
             self._map.clear()
-        here, last = posterior.state.T_odom_imu, before.T_odom_keyframe
-        due = not waiting and not settling and (paused is not None or keyframes.is_due(last, here, p.keyframe))
-        mapped = status is FrameStatus.TRACKING and paused is None
-        if due and last is not None and mapped and p.filter.learn_lines:
-            walked = float(np.linalg.norm(here[:3, 3] - last[:3, 3]))
-            lines = lines.learnt(posterior, points, scan.ring, walked, self._map, p.filter)
-        if not waiting:
-            self._insert(posterior, sampled.points, float(np.nan_to_num(registration.residual_rms)))
+        due = not (begun.waiting or settling) and (paused is not None or self._is_due(posterior))
+        if due and status is FrameStatus.TRACKING and paused is None and p.filter.learn_lines:
+            lines = self._learnt(lines, posterior, fused.points, scan.ring)
+        if not begun.waiting:
+            self._insert(posterior, fused.sampled, float(np.nan_to_num(fused.registration.residual_rms)))
         watch.lap("insert")
 
-        cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
-        for array in (points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns):
-            array.setflags(write=False)
+        cloud = _kept(fused.points, surface.labels, scan)
+        contradicted = before.contradicted or fused.registration.surprise > iekf.SURPRISING
         keyframe, certainty = None, before.certainty
         if due:
             certainty = (certainty or Certainty.begin(posterior, refined=p.filter.estimate_extrinsics)).moved(posterior)
-            resumed_ns, astray = 0 if paused is None else paused.end_ns, ASTRAY_M if contradicted else 0.0
-            keyframe = self._keyframe(posterior, cloud, certainty, resumed_ns, astray)
+            keyframe = self._keyframe(posterior, cloud, certainty, paused, astray=contradicted)
         watch.lap("keyframe")
 
-        if status is not before.status and FrameStatus.LOST in (status, before.status):
-            notices.append(f"Lost: {registration.reason}." if status is FrameStatus.LOST else "Tracking again.")
         result = StepResult(
             index=before.frame,
             stamp_ns=end_ns,
@@ -209,25 +179,24 @@ class Engine:
             T_map_odom=np.eye(4),
             cloud=cloud,
             ground=surface,
-            registration=registration,
+            registration=fused.registration,
             points_in=len(scan),
             points_reduced=len(reduced.points),
             points_filter=len(sampled.points),
             timings_ms=watch.laps(),
             keyframe=keyframe,
-            notices=tuple(notices),
+            notices=_notices(begun, before.status, status, fused.registration),
             truth_ground=scan.truth_ground,
-            imu_gap_s=silent_s,
+            imu_gap_s=imu.longest_gap(samples, end_ns),
             clock_late_s=clock.late,
             position_sigma=float(np.sqrt(np.linalg.eigvalsh(posterior.covariance[POS, POS])[-1])),
         )
-        T_odom_keyframe = before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu
         self._progress = EngineProgress(
             frame=before.frame + 1,
-            belief=None if waiting else posterior,
-            still=still,
+            belief=None if begun.waiting else posterior,
+            still=begun.still,
             status=status,
-            T_odom_keyframe=T_odom_keyframe,
+            T_odom_keyframe=before.T_odom_keyframe if keyframe is None else keyframe.T_odom_imu,
             certainty=certainty,
             floor=surface.floor,
             lines=lines,
@@ -267,25 +236,48 @@ class Engine:
         """Give the disk space of the keyframes back."""
         self.keyframes.close()
 
-    def _update(self, last: Belief, predicted: Belief, fuse: _Fuse) -> tuple[Belief, Registration]:
-        """What `fuse` gives; after a numerical failure, the prediction stands and the frame is lost."""
-        with contextlib.suppress(np.linalg.LinAlgError):
-            posterior, registration = fuse(self._map, self.params.filter)
-            if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
-                change, correction = (
-                    float(np.linalg.norm(after.v_odom_imu - before.v_odom_imu))
-                    for before, after in ((last.state, predicted.state), (predicted.state, posterior.state))
-                )
-                return posterior, replace(registration, predicted_change=change, correction=correction)
-        return predicted, replace(_NOT_REGISTERED, reason="the update gave no finite pose")
+    def _begin(self, scan: Scan, samples: ImuSamples, end_ns: int) -> _Begun:
+        """Go on from the frame before, begin anew after a pause, or start."""
+        before, p = self._progress, self.params
+        if before.belief is not None:
+            paused = pause.before(scan, samples, before.belief.state.stamp_ns)
+            if paused is None:
+                return _Begun(before.belief, samples, before.floor, before.paused)
+            belief, samples = pause.resumed(before.belief, paused, scan, samples, p)
+            self._map.clear()
+            notice = (
+                f"There are neither scans nor IMU samples for {paused.seconds:.1f} s. The map begins anew; loops tie "
+                "it to what was mapped before."
+            )
+            return _Begun(belief, samples, None, paused, notice=notice)
+        if not len(samples):
+            notice = "There is no IMU: motion is estimated from the LiDAR alone, less accurately."
+            return _Begun(coast.begin(scan, p), samples, before.floor, notice=notice)
+        started = start.proceed(before.still, scan, samples, p)
+        waiting = started.waiting and imu.longest_gap(samples, end_ns) <= p.imu.max_gap
+        return _Begun(
+            started.belief, samples, before.floor, still=started.still, waiting=waiting, notice=started.notice
+        )
 
-    def _insert(self, belief: Belief, points: np.ndarray, residual: float) -> None:
+    def _is_due(self, belief: Belief) -> bool:
+        return keyframes.is_due(self._progress.T_odom_keyframe, belief.state.T_odom_imu, self.params.keyframe)
+
+    def _learnt(self, lines: LineErrors, belief: Belief, points: F32, rings: U16) -> LineErrors:
+        """What a scan that becomes a keyframe, but not the first, adds to what is known of the lines."""
+        last = self._progress.T_odom_keyframe
+        if last is None:
+            return lines
+        walked = float(np.linalg.norm(belief.state.p_odom_imu - last[:3, 3]))
+        return lines.learnt(belief, points, rings, walked, self._map, self.params.filter)
+
+    def _insert(self, belief: Belief, points: F32, residual: float) -> None:
         T = belief.state.T_odom_lidar.astype(np.float32)
         self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
 
-    def _keyframe(self, belief: Belief, cloud: Cloud, certainty: Certainty, resumed_ns: int, astray: float) -> Keyframe:
-        state = belief.state
-        covariance = certainty.in_map(belief)
+    def _keyframe(
+        self, belief: Belief, cloud: Cloud, certainty: Certainty, paused: Interruption | None, *, astray: bool
+    ) -> Keyframe:
+        state, covariance = belief.state, certainty.in_map(belief)
         keyframe = Keyframe(
             index=len(self.keyframes),
             frame=self._progress.frame,
@@ -295,37 +287,45 @@ class Engine:
             covariance=covariance,
             cloud=cloud,
             drift=certainty.covariance(belief) - covariance,
-            resumed_ns=resumed_ns,
-            astray=astray,
+            resumed_ns=0 if paused is None else paused.end_ns,
+            astray=ASTRAY_M if astray else 0.0,
         )
         self.keyframes.append(keyframe)
         return keyframe
 
 
-_NOT_REGISTERED = Registration(
-    False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
-)
-
-
-def _status(waiting: bool, mapped: bool, registration: Registration) -> FrameStatus:
+def _status(fused: Fused, *, waiting: bool) -> FrameStatus:
     if waiting:
         return FrameStatus.INITIALISING
-    if mapped and registration.inliers < iekf.MIN_INLIERS:
-        return FrameStatus.LOST
-    return FrameStatus.TRACKING
+    too_few = fused.registration is not NOT_REGISTERED and fused.registration.inliers < iekf.MIN_INLIERS
+    return FrameStatus.LOST if fused.adrift or too_few else FrameStatus.TRACKING
 
 
-def _down_in_lidar(belief: Belief) -> np.ndarray:
-    state = belief.state
+def _notices(begun: _Begun, last: FrameStatus, status: FrameStatus, registration: Registration) -> tuple[str, ...]:
+    begun_by = (begun.notice,) if begun.notice else ()
+    if status is last or FrameStatus.LOST not in (status, last):
+        return begun_by
+    return (*begun_by, f"Lost: {registration.reason}." if status is FrameStatus.LOST else "Tracking again.")
+
+
+def _down_in_lidar(state: NavState) -> F64:
     down = (state.R_odom_imu @ state.R_imu_lidar).T @ state.g_odom
     return np.asarray(down / np.linalg.norm(down))
 
 
-def _in_range(scan: Scan, nearest: float, farthest: float) -> Scan:
+def _in_range(scan: Scan, params: SensorParams) -> Scan:
     keep = np.empty(len(scan), dtype=np.bool_)
-    if clouds.in_range(scan.points, nearest, farthest, keep) == len(scan):
+    if clouds.in_range(scan.points, params.min_range, params.max_range, keep) == len(scan):
         return scan
     return scan.part(keep)
+
+
+def _kept(points: F32, labels: U8, scan: Scan) -> Cloud:
+    """A scan's deskewed points and the rest of it, none of which changes any more."""
+    cloud = Cloud(points, labels, scan.intensity, scan.ring, scan.offsets_ns)
+    for array in (points, labels, scan.intensity, scan.ring, scan.offsets_ns):
+        array.setflags(write=False)
+    return cloud
 
 
 class _Stopwatch:

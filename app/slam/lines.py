@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from app.slam import channels
 from app.slam.imu import Belief
 from app.slam.kernels import lines as kernels
 from app.slam.kernels import registration
 from app.slam.local_map import LocalMap
 from app.slam.sections import FilterParams
-from app.slam.types import F32, F64, U16
+from app.slam.types import F32, F64, U16, Scan
 
 LINES = 256
 """Number of lines whose errors are estimated; further lines of a scanner stay uncorrected."""
@@ -45,6 +46,9 @@ class LineErrors:
     @classmethod
     def unknown(cls) -> "LineErrors":
         return cls(np.zeros((LINES, 2)), np.zeros((LINES, 2, 2)), np.zeros((LINES, 2)))
+
+    def set_right(self, scan: Scan) -> Scan:
+        return channels.bent(scan, -self.errors[:, 1], -self.errors[:, 0]) if self.errors.any() else scan
 
     def learnt(
         self, belief: Belief, points: F32, rings: U16, walked: float, local_map: LocalMap, params: FilterParams

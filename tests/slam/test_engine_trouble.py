@@ -1,4 +1,7 @@
-"""What the engine does with bad scans, gaps and people in the way."""
+"""What the engine does with bad scans, gaps and people in the way.
+
+Tests app/slam/prediction.py and app/slam/fusion.py.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import fields, replace

@@ -1,0 +1,96 @@
+"""Compares a scan with the map and corrects what was predicted (paper 2.3, eq. 5-7).
+
+Where the IMU tells how the device moved during the scan, the filter estimates the pose at its end (`iekf`). Otherwise
+the scan determines its own motion too (`coast`).
+"""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from app.slam import coast, iekf, imu
+from app.slam.coast import Course
+from app.slam.imu import Belief
+from app.slam.local_map import LocalMap
+from app.slam.params import Params
+from app.slam.prediction import Prediction
+from app.slam.types import F32, I32, Registration, Scan
+from app.slam.voxel import spread
+
+NOT_REGISTERED = Registration(
+    False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Fused:
+    """Attributes:
+    belief: at the scan's end. registration: how it went.
+    points: (n, 3) m, the scan, deskewed. sampled: (m, 3) m, those that enter the map; both in the LiDAR frame.
+    adrift: whether nothing measures the speed any more.
+    """
+
+    belief: Belief
+    registration: Registration
+    points: F32
+    sampled: F32
+    adrift: bool = False
+
+
+def fuse(
+    motion: Prediction, scan: Scan, points: F32, sampled: F32, source: I32, local_map: LocalMap, params: Params
+) -> Fused:
+    """The prediction, corrected by a scan; unchanged if the map is empty or too little of it is met.
+
+    Args:
+        scan: as measured. points: (n, 3) m, deskewed by the prediction.
+        sampled: (m, 3) m, the same, thinned. source: (m,) which points of the scan these are nearest to.
+    """
+    if not local_map.voxels:
+        fused = Fused(motion.belief, NOT_REGISTERED, points, sampled)
+    elif motion.course is None:
+        fused = Fused(*_with_imu(motion, sampled, local_map, params), points, sampled)
+    else:
+        fused = _by_scan(motion, motion.course, scan, source, local_map, params)
+    belief = imu.after_gap(fused.belief, motion.begin) if motion.gap else fused.belief
+    if iekf.is_imu_to_blame(fused.registration):
+        belief = imu.with_open_biases(belief)
+    return replace(fused, belief=belief)
+
+
+def _with_imu(motion: Prediction, sampled: F32, local_map: LocalMap, params: Params) -> tuple[Belief, Registration]:
+    begin, predicted = motion.begin.state, motion.belief
+    chosen = spread(sampled, params.filter.max_points, params.scan.voxel_size)
+    posterior, registration = _attempted(predicted, partial(iekf.update, predicted, chosen, local_map, params.filter))
+    change = float(np.linalg.norm(predicted.state.v_odom_imu - begin.v_odom_imu))
+    correction = float(np.linalg.norm(posterior.state.v_odom_imu - predicted.state.v_odom_imu))
+    registration = replace(registration, predicted_change=change, correction=correction)
+    if registration.surprise > iekf.SURPRISING:  # once more, as if nothing were known of the speed
+        open_speed = imu.with_open_speed(predicted, (predicted.state.stamp_ns - begin.stamp_ns) * 1e-9)
+        posterior, _ = _attempted(predicted, partial(iekf.update, open_speed, chosen, local_map, params.filter))
+    return posterior, registration
+
+
+def _by_scan(motion: Prediction, course: Course, scan: Scan, source: I32, local_map: LocalMap, params: Params) -> Fused:
+    """From the measured points themselves, since centroids have no time."""
+    refines = params.filter.estimate_extrinsics and not motion.gap
+    update = partial(coast.update, motion.belief, scan.part(source), course, local_map, params.filter, refines)
+    posterior, registration = _attempted(motion.belief, update)
+    points = coast.deskew(scan, posterior.state, course)
+    adrift = not motion.covered and registration.degenerate and coast.is_adrift(posterior)
+    if adrift:
+        why = "there is no IMU" if motion.path is None else "the IMU is silent"
+        registration = replace(registration, reason=f"{registration.reason}, and {why}")
+    return Fused(posterior, registration, points, points[source], adrift)
+
+
+def _attempted(predicted: Belief, update: Callable[[], tuple[Belief, Registration]]) -> tuple[Belief, Registration]:
+    """What the update gives; after a numerical failure, the prediction stands and the frame is lost."""
+    with contextlib.suppress(np.linalg.LinAlgError):
+        posterior, registration = update()
+        if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
+            return posterior, registration
+    return predicted, replace(NOT_REGISTERED, reason="the update gave no finite pose")
