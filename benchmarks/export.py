@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from app.export.results import Results, of_formats, save_results
+from app.export.exports import of_formats, save_results
+from app.export.results import Results
 from app.slam.params import Params
 from app.slam.provenance import peak_memory_mb
 from app.slam.run_log import RunInfo, RunLog

@@ -10,8 +10,9 @@ from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:
     from app.export.box import Box
+    from app.export.exports import Export
     from app.export.points import Choice
-    from app.export.results import Export, Results
+    from app.export.results import Results
 
 
 def export(
@@ -77,9 +78,9 @@ def export(
       hemislam export session.hemislam --format laz --box=-10,-10,-1,10,10,3
       hemislam export runs/walk-1 --format section --box=-10,-0.2,-2,10,0.2,3,30
     """
+    from app.export.exports import of_formats
     from app.export.folder import read_results
     from app.export.points import Choice
-    from app.export.results import of_formats
 
     exports = of_formats([name.strip() for name in formats.split(",") if name.strip()])
     choice = Choice(thin, _box(box), slab, moving)
@@ -113,7 +114,7 @@ def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]
 
 
 def _save(results: "Results", folder: Path, exports: "tuple[Export, ...]") -> None:
-    from app.export.results import save_results
+    from app.export.exports import save_results
 
     with progress_bar("Exporting") as show:
         results.progress = show

@@ -121,8 +121,8 @@ def _bent(
     results: Path, out: Path, fixes: "Fixes", found: "Alignment", overridden: dict[str, bool], *, replace: bool
 ) -> "tuple[Alignment, Trajectory]":
     """Write trajectory and map, bent by the fixes, to `out`, and remove what another run has left there."""
+    from app.export.exports import BY_RUN, save_results
     from app.export.folder import read_results
-    from app.export.results import BY_RUN, save_results
     from app.mapping.earth import bent
 
     after = bent(read_results(results), fixes, found, overridden)

@@ -36,7 +36,7 @@ def replay(
       hemislam replay session.hemislam --to-end --out results/walk
     """
     from app.cli.run import free_folder, save
-    from app.export.results import prepare_folder
+    from app.export.exports import prepare_folder
 
     folder = out or free_folder(session)
     prepare_folder(folder, replace=force)

@@ -66,7 +66,7 @@ def run(
       hemislam run walk.mcap --loops edits.yaml
     """
     from app.evaluation.truth import check_poses
-    from app.export.results import prepare_folder
+    from app.export.exports import prepare_folder
     from app.mapping.opening import open_session
     from app.slam.doubts import doubts
     from app.slam.loops import edit_files

@@ -16,7 +16,7 @@ from app.baselines.poses import keep_keyframe
 from app.baselines.systems import find_system
 from app.evaluation import crops, map_sharpness
 from app.evaluation.job import GROUND_RANGES_M, Job, all_or_nothing
-from app.export.results import timings_csv
+from app.export.exports import timings_csv
 from app.mapping.feed import FeedInfo, FileFeed
 from app.mapping.opening import open_session
 from app.mapping.painted import UNMARKED

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from app.export.results import BY_RUN, Results, of_formats, save_results
+from app.export.exports import BY_RUN, of_formats, save_results
+from app.export.results import Results
 from app.georeference.survey import Survey
 from app.mapping.kept import Kept
 from app.mapping.session_file import SUFFIX, SavedSession, write_session

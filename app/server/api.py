@@ -20,7 +20,7 @@ from fastapi import Path as PathParam
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from app.export.results import EXPORTS
+from app.export.exports import EXPORTS
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol

@@ -9,8 +9,8 @@ from typing import Final
 
 import viser
 
+from app.export.exports import BY_RUN, EXPORTS, FORMATS
 from app.export.points import Choice
-from app.export.results import BY_RUN, EXPORTS, FORMATS
 from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
 from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot

@@ -24,7 +24,7 @@ from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import app.evaluation.truth
-import app.export.results
+import app.export.exports
 import app.mapping.opening
 import app.slam.doubts  # noqa: F401
 from app.sensors.cloud_types import read_point_cloud_2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pypcd4 import PointCloud
 
-from app.export.results import FORMATS
+from app.export.exports import FORMATS
 from app.mapping.session_file import Opened, SavedSession, State, size_of, write_session
 from app.sensors.presets import resolve_params
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.export.results import BY_RUN
+from app.export.exports import BY_RUN
 from app.mapping.session import Session
 from app.mapping.session_file import Opened, SavedSession, State, size_of, write_session
 from app.sensors.presets import resolve_params

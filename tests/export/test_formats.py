@@ -16,8 +16,8 @@ from pypcd4 import PointCloud
 from test_las import UTM, room
 from test_plan import room as plan_room
 
-from app.export import results as table
-from app.export.results import of_formats, save_results
+from app.export import exports
+from app.export.exports import of_formats, save_results
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -100,7 +100,7 @@ def test_a_recording_whose_name_is_no_utf_8_is_delivered(tmp_path: Path) -> None
 
 
 def test_what_is_not_installed_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(table.EXTRAS, "e57", ("no_such_module",))
+    monkeypatch.setitem(exports.EXTRAS, "e57", ("no_such_module",))
     with pytest.raises(HemislamError, match=r"pip install 'hemislam\[e57\]'"):
         of_formats(["e57"])
 

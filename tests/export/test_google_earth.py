@@ -15,7 +15,7 @@ from PIL import Image
 from test_las import UTM
 from test_plan import room
 
-from app.export.results import of_formats, save_results
+from app.export.exports import of_formats, save_results
 from app.slam.errors import HemislamError
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"

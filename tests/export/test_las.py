@@ -9,8 +9,9 @@ import pytest
 from pypcd4 import PointCloud
 from test_results import START_NS, keyframe, logged
 
+from app.export.exports import of_formats, save_results
 from app.export.points import Choice, blocks
-from app.export.results import Results, of_formats, save_results
+from app.export.results import Results
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
 from app.slam.map_frame import MapFrame

@@ -17,8 +17,9 @@ from test_las import UTM
 from test_results import keyframe, logged
 
 from app.export.box import Box
+from app.export.exports import of_formats, save_results
 from app.export.points import Choice
-from app.export.results import Results, of_formats, save_results
+from app.export.results import Results
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
 from app.slam.params import Params

@@ -1,6 +1,7 @@
 """What a run writes: complete, readable by others, and never over older results by accident.
 
-Tests app/export/folder.py, app/export/map_file.py, app/export/points.py, app/slam/ply.py, app/slam/run_log.py.
+Tests app/export/exports.py, app/export/folder.py, app/export/map_file.py, app/export/points.py, app/slam/ply.py,
+app/slam/run_log.py.
 """
 
 import csv
@@ -13,10 +14,11 @@ import numpy as np
 import pytest
 
 from app.export.box import Box
+from app.export.exports import BY_RUN, EXPORTS, save_results
 from app.export.folder import read_results
 from app.export.map_file import KEYFRAME, VERTEX, MapFile, write
 from app.export.points import Choice, blocks
-from app.export.results import BY_RUN, EXPORTS, Results, save_results
+from app.export.results import Results
 from app.georeference import reference
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame

@@ -15,8 +15,9 @@ from test_plan import FLOOR, HIGH, LOW, room
 from test_results import frame, keyframe
 
 from app.export.box import Box
+from app.export.exports import of_formats, save_results
 from app.export.points import Choice
-from app.export.results import Results, of_formats, save_results
+from app.export.results import Results
 from app.export.section import along_path, strides
 from app.georeference.reference import GeoReference
 from app.slam import lie

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from test_rewind import SAMPLE, Bench
 
-from app.export.results import BY_RUN
+from app.export.exports import BY_RUN
 from app.mapping.checkpoints import DEFAULT_BYTES
 from app.mapping.loops import LoopProcess, RestartingLoops
 from app.mapping.opening import open_session
