@@ -33,7 +33,7 @@ from app.slam.types import (
     Registration,
     Scan,
     StepResult,
-)  # fmt: skip
+)
 from app.slam.voxel import VoxelGrid
 
 
@@ -130,13 +130,13 @@ class Engine:
         scan = lines.set_right(_in_range(channels.corrected(scan, p.sensor), p.sensor))
         samples = clock.set_right(samples)
         begun = self._begin(scan, samples, end_ns)
-        motion = predict(begun.belief, begun.samples, end_ns, p.imu, clock.sigma)
+        prediction = predict(begun.belief, begun.samples, end_ns, p.imu, clock.sigma)
         watch.lap("propagate")
-        points = motion.deskew(scan)
+        points = prediction.deskew(scan)
         watch.lap("deskew")
 
         # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
-        predicted = motion.belief.state
+        predicted = prediction.belief.state
         down = _down_in_lidar(predicted)
         surface = ground.segment(points, scan.ring, down, p.ground, begun.floor, predicted.T_odom_lidar)
         watch.lap("ground")
@@ -145,12 +145,12 @@ class Engine:
         watch.lap("downsample")
 
         # paper 2.3, eq. 5-7
-        fused = fuse(motion, scan, points, sampled.points, reduced.source[sampled.source], self._map, p)
+        fused = fuse(prediction, scan, points, sampled.points, reduced.source[sampled.source], self._map, p)
         status = _status(fused, waiting=begun.waiting)
         watch.lap("update")
 
         posterior, paused = fused.belief, begun.paused
-        if status is FrameStatus.TRACKING and fused.registration.inliers and motion.covered and p.imu.learn_clock:
+        if status is FrameStatus.TRACKING and fused.registration.inliers and prediction.covered and p.imu.learn_clock:
             clock = clock.learnt(begun.samples, predicted, posterior.state)
         settling = paused is not None and not pause.is_over(paused, end_ns)
         if paused is not None and not settling:

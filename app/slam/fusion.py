@@ -41,7 +41,7 @@ class Fused:
 
 
 def fuse(
-    motion: Prediction, scan: Scan, points: F32, sampled: F32, source: I32, local_map: LocalMap, params: Params
+    prediction: Prediction, scan: Scan, points: F32, sampled: F32, source: I32, local_map: LocalMap, params: Params
 ) -> Fused:
     """The prediction, corrected by a scan; unchanged if the map is empty or too little of it is met.
 
@@ -50,19 +50,19 @@ def fuse(
         sampled: (m, 3) m, the same, thinned. source: (m,) which points of the scan these are nearest to.
     """
     if not local_map.voxels:
-        fused = Fused(motion.belief, NOT_REGISTERED, points, sampled)
-    elif motion.course is None:
-        fused = Fused(*_with_imu(motion, sampled, local_map, params), points, sampled)
+        fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled)
+    elif prediction.course is None:
+        fused = Fused(*_with_imu(prediction, sampled, local_map, params), points, sampled)
     else:
-        fused = _by_scan(motion, motion.course, scan, source, local_map, params)
-    belief = imu.after_gap(fused.belief, motion.begin) if motion.gap else fused.belief
+        fused = _by_scan(prediction, prediction.course, scan, source, local_map, params)
+    belief = imu.after_gap(fused.belief, prediction.begin) if prediction.gap else fused.belief
     if iekf.is_imu_to_blame(fused.registration):
         belief = imu.with_open_biases(belief)
     return replace(fused, belief=belief)
 
 
-def _with_imu(motion: Prediction, sampled: F32, local_map: LocalMap, params: Params) -> tuple[Belief, Registration]:
-    begin, predicted = motion.begin.state, motion.belief
+def _with_imu(prediction: Prediction, sampled: F32, local_map: LocalMap, params: Params) -> tuple[Belief, Registration]:
+    begin, predicted = prediction.begin.state, prediction.belief
     chosen = spread(sampled, params.filter.max_points, params.scan.voxel_size)
     posterior, registration = _attempted(predicted, partial(iekf.update, predicted, chosen, local_map, params.filter))
     change = float(np.linalg.norm(predicted.state.v_odom_imu - begin.v_odom_imu))
@@ -74,15 +74,17 @@ def _with_imu(motion: Prediction, sampled: F32, local_map: LocalMap, params: Par
     return posterior, registration
 
 
-def _by_scan(motion: Prediction, course: Course, scan: Scan, source: I32, local_map: LocalMap, params: Params) -> Fused:
+def _by_scan(
+    prediction: Prediction, course: Course, scan: Scan, source: I32, local_map: LocalMap, params: Params
+) -> Fused:
     """From the measured points themselves, since centroids have no time."""
-    refines = params.filter.estimate_extrinsics and not motion.gap
-    update = partial(coast.update, motion.belief, scan.part(source), course, local_map, params.filter, refines)
-    posterior, registration = _attempted(motion.belief, update)
+    refines = params.filter.estimate_extrinsics and not prediction.gap
+    update = partial(coast.update, prediction.belief, scan.part(source), course, local_map, params.filter, refines)
+    posterior, registration = _attempted(prediction.belief, update)
     points = coast.deskew(scan, posterior.state, course)
-    adrift = not motion.covered and registration.degenerate and coast.is_adrift(posterior)
+    adrift = not prediction.covered and registration.degenerate and coast.is_adrift(posterior)
     if adrift:
-        why = "there is no IMU" if motion.path is None else "the IMU is silent"
+        why = "there is no IMU" if prediction.path is None else "the IMU is silent"
         registration = replace(registration, reason=f"{registration.reason}, and {why}")
     return Fused(posterior, registration, points, points[source], adrift)
 

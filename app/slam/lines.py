@@ -48,6 +48,7 @@ class LineErrors:
         return cls(np.zeros((LINES, 2)), np.zeros((LINES, 2, 2)), np.zeros((LINES, 2)))
 
     def set_right(self, scan: Scan) -> Scan:
+        """The scan without these errors; the same one if none are known."""
         return channels.bent(scan, -self.errors[:, 1], -self.errors[:, 0]) if self.errors.any() else scan
 
     def learnt(
