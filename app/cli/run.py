@@ -125,8 +125,13 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
 
 def look_for_mounting(recording: Path, params: "Params") -> str:
     """What the recording shows about its mounting if the parameters differ, in a sentence; "" if nothing."""
+    from app.calibration.calibrate import is_mounting_unknown
+
     found = _contradicted(recording, params, "Looking for the cause")
-    return found if isinstance(found, str) else f"{found.contradiction()}: {_saving(recording)}"
+    if isinstance(found, str):
+        return found
+    used = "; `run` and `serve` use this. To save it" if is_mounting_unknown(params) else ""
+    return f"{found.contradiction()}{used}: {_saving(recording)}"
 
 
 def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration | str":

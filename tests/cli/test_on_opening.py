@@ -55,4 +55,4 @@ def test_info_shows_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.Monk
     rehearsed(monkeypatch)
     told = CliRunner().invoke(cli, ["info", str(walk)]).output
     assert "rotated by 70°, -50°, 104° on the IMU, and the IMU's clock" in told
-    assert f"hemislam calibrate {walk} --write" in told
+    assert f"`run` and `serve` use this. To save it: hemislam calibrate {walk} --write" in told
