@@ -15,6 +15,7 @@ from app.slam.types import I64
 COLUMNS = (
     "older", "newer", "older_stamp_s", "newer_stamp_s", "verdict", "origin", "edited", "weight",
     "represented_by", "repeats", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw",
+    "sigma_m", "along_x", "along_y", "along_z", "across_m", "sigma_deg",
     "context_distance", "overlap", "residual_m", "slide_m", "alternative_m", "mahalanobis_sigma", "gate_m", "support",
     "reason",
 )  # fmt: skip
@@ -55,6 +56,16 @@ def tied_pauses(edges: Iterable[LoopEdge], stamps_ns: I64, pauses_ns: I64) -> I6
     return np.asarray(pauses_ns[spanned.any(axis=1)])
 
 
+def _certainty(edge: LoopEdge) -> tuple[float, ...]:
+    """Standard deviation of the position (m) where it is largest, this direction in the older's IMU frame (unit), the
+    largest one across it (m), and the largest one of the rotation (deg)."""
+    R = edge.T_older_newer[:3, :3]
+    values, axes = np.linalg.eigh(R @ edge.covariance[3:, 3:] @ R.T)
+    rotation = np.linalg.eigvalsh(edge.covariance[:3, :3])[-1]
+    across, along = np.sqrt(np.maximum(values[1:], 0.0))
+    return along, *axes[:, 2], across, float(np.degrees(np.sqrt(max(rotation, 0.0))))
+
+
 def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
     """One line a candidate; the pose is T_older_newer of the IMU frames, numbers that were not measured are empty.
 
@@ -64,6 +75,7 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
     rows = []
     for edge in edges:
         T, e = edge.T_older_newer, edge.evidence
+        registered = e.overlap == e.overlap  # else it is nan
         pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
         measures = (e.context_distance, e.overlap, e.residual_rms, e.slide, e.alternative_m, e.mahalanobis, e.gate_m)
         rows.append(
@@ -78,6 +90,7 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
                 f"{edge.weight:g}",
                 *("-".join(str(keyframe) for keyframe in pair or ()) for pair in (edge.represented_by, edge.repeats)),
                 *(f"{value:.6f}" for value in pose),
+                *(f"{value:.4f}" if registered else "" for value in _certainty(edge)),
                 *("" if value != value else f"{value:.4f}" for value in measures),
                 e.support,
                 edge.reason,
