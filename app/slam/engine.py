@@ -9,7 +9,7 @@ from app.slam import channels, coast, ground, iekf, imu, keyframes, pause, start
 from app.slam.certainty import Certainty
 from app.slam.clock import ClockOffset
 from app.slam.floor import Floor
-from app.slam.fusion import NOT_REGISTERED, Fused, fuse
+from app.slam.fusion import fuse
 from app.slam.imu import POS, Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
@@ -146,7 +146,8 @@ class Engine:
 
         # paper 2.3, eq. 5-7
         fused = fuse(prediction, scan, points, sampled.points, reduced.source[sampled.source], self._map, p)
-        status = _status(fused, waiting=begun.waiting)
+        status = FrameStatus.LOST if fused.lost else FrameStatus.TRACKING
+        status = FrameStatus.INITIALISING if begun.waiting else status
         watch.lap("update")
 
         posterior, paused = fused.belief, begun.paused
@@ -292,13 +293,6 @@ class Engine:
         )
         self.keyframes.append(keyframe)
         return keyframe
-
-
-def _status(fused: Fused, *, waiting: bool) -> FrameStatus:
-    if waiting:
-        return FrameStatus.INITIALISING
-    too_few = fused.registration is not NOT_REGISTERED and fused.registration.inliers < iekf.MIN_INLIERS
-    return FrameStatus.LOST if fused.adrift or too_few else FrameStatus.TRACKING
 
 
 def _notices(begun: _Begun, last: FrameStatus, status: FrameStatus, registration: Registration) -> tuple[str, ...]:

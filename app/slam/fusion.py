@@ -20,7 +20,7 @@ from app.slam.prediction import Prediction
 from app.slam.types import F32, I32, Registration, Scan
 from app.slam.voxel import spread
 
-NOT_REGISTERED = Registration(
+_NOT_REGISTERED = Registration(
     False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
 )
 
@@ -30,14 +30,14 @@ class Fused:
     """Attributes:
     belief: at the scan's end. registration: how it went.
     points: (n, 3) m, the scan, deskewed. sampled: (m, 3) m, those that enter the map; both in the LiDAR frame.
-    adrift: whether nothing measures the speed any more.
+    lost: whether the pose is a guess: the scan met too few planes, or nothing measures the speed any more.
     """
 
     belief: Belief
     registration: Registration
     points: F32
     sampled: F32
-    adrift: bool = False
+    lost: bool = False
 
 
 def fuse(
@@ -50,7 +50,7 @@ def fuse(
         sampled: (m, 3) m, the same, thinned. source: (m,) which points of the scan these are nearest to.
     """
     if not local_map.voxels:
-        fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled)
+        fused = Fused(prediction.belief, _NOT_REGISTERED, points, sampled)
     elif prediction.course is None:
         fused = Fused(*_with_imu(prediction, sampled, local_map, params), points, sampled)
     else:
@@ -58,7 +58,8 @@ def fuse(
     belief = imu.after_gap(fused.belief, prediction.begin) if prediction.gap else fused.belief
     if iekf.is_imu_to_blame(fused.registration):
         belief = imu.with_open_biases(belief)
-    return replace(fused, belief=belief)
+    too_few = local_map.voxels > 0 and fused.registration.inliers < iekf.MIN_INLIERS
+    return replace(fused, belief=belief, lost=fused.lost or too_few)
 
 
 def _with_imu(prediction: Prediction, sampled: F32, local_map: LocalMap, params: Params) -> tuple[Belief, Registration]:
@@ -86,7 +87,7 @@ def _by_scan(
     if adrift:
         why = "there is no IMU" if prediction.path is None else "the IMU is silent"
         registration = replace(registration, reason=f"{registration.reason}, and {why}")
-    return Fused(posterior, registration, points, points[source], adrift)
+    return Fused(posterior, registration, points, points[source], lost=adrift)
 
 
 def _attempted(predicted: Belief, update: Callable[[], tuple[Belief, Registration]]) -> tuple[Belief, Registration]:
@@ -95,4 +96,4 @@ def _attempted(predicted: Belief, update: Callable[[], tuple[Belief, Registratio
         posterior, registration = update()
         if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
             return posterior, registration
-    return predicted, replace(NOT_REGISTERED, reason="the update gave no finite pose")
+    return predicted, replace(_NOT_REGISTERED, reason="the update gave no finite pose")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.slam import iekf
-from app.slam.fusion import fuse
+from app.slam.fusion import Fused, fuse
 from app.slam.imu import DIM, Belief, Path
 from app.slam.local_map import LocalMap
 from app.slam.params import Params
@@ -22,14 +22,13 @@ def test_after_a_numerical_failure_the_prediction_stands_and_the_frame_is_lost(c
     scan = Scan(0, points, *(np.zeros(len(points), kind) for kind in (np.int32, np.float32, np.uint16)))
     path = Path(np.array([-0.1, 0.0]), np.tile(np.eye(4)[:3], (2, 1, 1)))
 
-    def fused(covariance: np.ndarray, local_map: LocalMap) -> tuple[Belief, str, int]:
+    def fused(covariance: np.ndarray, local_map: LocalMap) -> Fused:
         belief = Belief(truth(), covariance)
-        motion = Prediction(belief, belief, path, gap=False, course=None)
-        found = fuse(motion, scan, points, points, np.arange(len(points)), local_map, Params())
-        return found.belief, found.registration.reason, found.registration.inliers
+        prediction = Prediction(belief, belief, path, gap=False, course=None)
+        return fuse(prediction, scan, points, points, np.arange(len(points)), local_map, Params())
 
-    belief, reason, inliers = fused(covariance, room)
-    assert np.array_equal(belief.state.T_odom_imu, truth().T_odom_imu) and inliers == 0
-    assert reason == "the update gave no finite pose"
-    assert fused(uncertain(), room)[2] > iekf.MIN_INLIERS
-    assert fused(uncertain(), LocalMap(MapParams()))[1] == "the map is still empty; this scan begins it"
+    failed, good, first = fused(covariance, room), fused(uncertain(), room), fused(uncertain(), LocalMap(MapParams()))
+    assert failed.lost and np.array_equal(failed.belief.state.T_odom_imu, truth().T_odom_imu)
+    assert failed.registration.inliers == 0 and failed.registration.reason == "the update gave no finite pose"
+    assert not good.lost and good.registration.inliers > iekf.MIN_INLIERS
+    assert not first.lost and first.registration.reason == "the map is still empty; this scan begins it"

@@ -57,8 +57,10 @@ def tied_pauses(edges: Iterable[LoopEdge], stamps_ns: I64, pauses_ns: I64) -> I6
 
 
 def _certainty(edge: LoopEdge) -> tuple[float, ...]:
-    """Standard deviation of the position (m) where it is largest, this direction in the older's IMU frame (unit), the
-    largest one across it (m), and the largest one of the rotation (deg)."""
+    """Standard deviation of the position (m) in its least certain direction, this direction in the older's IMU frame
+    (unit), the largest one across it (m), and the largest one of the rotation (deg); nan if nothing was registered."""
+    if np.isnan(edge.evidence.overlap):
+        return (np.nan,) * 6
     R = edge.T_older_newer[:3, :3]
     values, axes = np.linalg.eigh(R @ edge.covariance[3:, 3:] @ R.T)
     rotation = np.linalg.eigvalsh(edge.covariance[:3, :3])[-1]
@@ -75,7 +77,6 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
     rows = []
     for edge in edges:
         T, e = edge.T_older_newer, edge.evidence
-        registered = e.overlap == e.overlap  # else it is nan
         pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
         measures = (e.context_distance, e.overlap, e.residual_rms, e.slide, e.alternative_m, e.mahalanobis, e.gate_m)
         rows.append(
@@ -90,8 +91,7 @@ def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
                 f"{edge.weight:g}",
                 *("-".join(str(keyframe) for keyframe in pair or ()) for pair in (edge.represented_by, edge.repeats)),
                 *(f"{value:.6f}" for value in pose),
-                *(f"{value:.4f}" if registered else "" for value in _certainty(edge)),
-                *("" if value != value else f"{value:.4f}" for value in measures),
+                *("" if value != value else f"{value:.4f}" for value in (*_certainty(edge), *measures)),
                 e.support,
                 edge.reason,
             ]
