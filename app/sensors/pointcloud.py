@@ -91,9 +91,6 @@ def decode(cloud: CloudMessage, layout: CloudLayout) -> Scan:
     ground = None
     if layout.ground_field:
         ground = (values_at(cloud.column(layout.ground_field), index) != 0).astype(np.uint8)
-    for array in (points, offsets_ns, intensity, ring, ground):
-        if array is not None:
-            array.setflags(write=False)
     return Scan(begin_ns, points, offsets_ns, intensity, ring, ground, refused)
 
 

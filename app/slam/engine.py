@@ -133,6 +133,7 @@ class Engine:
         prediction = predict(begun.belief, begun.samples, end_ns, p.imu, clock.sigma)
         watch.lap("propagate")
         points = prediction.deskew(scan)
+        points.setflags(write=False)
         watch.lap("deskew")
 
         # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
@@ -316,10 +317,9 @@ def _in_range(scan: Scan, params: SensorParams) -> Scan:
 
 def _kept(points: F32, labels: U8, scan: Scan) -> Cloud:
     """A scan's deskewed points and the rest of it, none of which changes any more."""
-    cloud = Cloud(points, labels, scan.intensity, scan.ring, scan.offsets_ns)
-    for array in (points, labels, scan.intensity, scan.ring, scan.offsets_ns):
+    for array in (points, labels):
         array.setflags(write=False)
-    return cloud
+    return Cloud(points, labels, scan.intensity, scan.ring, scan.offsets_ns)
 
 
 class _Stopwatch:

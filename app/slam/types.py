@@ -38,7 +38,7 @@ def is_ground(labels: U8) -> Mask:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One LiDAR revolution as measured, in any order, without invalid returns.
+    """One LiDAR revolution as measured, in any order, without invalid returns. Its arrays become read-only.
 
     Attributes:
         stamp_ns: time of the FIRST point.
@@ -57,6 +57,11 @@ class Scan:
     ring: U16
     truth_ground: U8 | None = None
     refused: int = 0
+
+    def __post_init__(self) -> None:
+        for array in (self.points, self.offsets_ns, self.intensity, self.ring, self.truth_ground):
+            if array is not None:
+                array.setflags(write=False)
 
     @property
     def end_ns(self) -> int:

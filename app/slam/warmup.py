@@ -1,7 +1,6 @@
 """Compile every kernel once, with progress. It takes a while on the first start of a new installation."""
 
 from collections.abc import Callable
-from itertools import product
 
 import numpy as np
 
@@ -27,8 +26,6 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     floor = np.stack([u.ravel(), v.ravel(), np.full(u.size, -1.3)], axis=1).astype(np.float32)
     n = len(floor)
     scan = Scan(0, floor, np.arange(n, dtype=np.int32), np.zeros(n, np.float32), np.zeros(n, np.uint16))
-    for array in (scan.points, scan.offsets_ns, scan.ring):
-        array.setflags(write=False)  # as the engine meets them
     samples = ImuSamples(np.array([0, 5_000_000]), np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
     belief = start.standing(samples, 0, params)
     local_map, grid = LocalMap(MapParams(max_voxels=1000)), VoxelGrid()
@@ -37,22 +34,22 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
     predicted, path = imu.propagate(belief, samples, 5_000_000, params.imu)
     progress("deskew", 0.25)
     points = imu.deskew(scan, path, predicted.state)
-    imu.deskew(channels.bent(scan, np.zeros(1), np.zeros(1)), path, predicted.state)
+    points.setflags(write=False)  # as in a frame
+    channels.bent(scan, np.zeros(1), np.zeros(1))
     progress("ground segmentation", 0.28)
     surface = ground.segment(points, scan.ring, np.array([0.0, 0.0, -1.0]), params.ground)
     progress("downsampling", 0.3)
-    grid.downsample(points, 0.3, chosen=surface.labels)
+    sampled = grid.downsample(points, 0.01, chosen=surface.labels).points
     progress("local map", 0.32)
-    local_map.insert(points, np.array([100.0, 0.0, 0.0]), params.map)
+    local_map.insert(sampled, np.array([100.0, 0.0, 0.0]), params.map)
     progress("registration", 0.35)
-    posterior, _ = iekf.update(predicted, points, local_map, params.filter)
+    posterior, _ = iekf.update(predicted, sampled, local_map, params.filter)
     iekf.boxminus(posterior.state, predicted.state)
     manifold.log(np.eye(3))
     lie.log(np.eye(3))
     LineErrors.unknown().learnt(posterior, points, scan.ring, 1.0, local_map, params.filter)
     progress("a whole frame", 0.9)
     _run_frames(scan, samples, params)
-    points.setflags(write=False)  # as the store of keyframes gives them
     surface.labels.setflags(write=False)
     cloud = Cloud(points, surface.labels, scan.intensity, scan.ring, scan.offsets_ns)
     keyframe = Keyframe(0, 0, 0, np.eye(4), np.eye(4), np.eye(6), cloud)
@@ -62,10 +59,9 @@ def compile_kernels(progress: Callable[[str, float], None] = lambda name, fracti
 
 
 def _run_frames(scan: Scan, samples: ImuSamples, params: Params) -> None:
-    """With arrays that are read-only, and with writable copies once some points are out of range; with ground seen
-    straight down, and without."""
+    """With ground seen straight down, and without."""
     engine = Engine(params)
-    for farthest, alpha in product((params.sensor.max_range, 4.0), (params.ground.alpha, 1.0)):
-        engine.params = params.with_values({"sensor.max_range": farthest, "ground.alpha": alpha})
+    for alpha in (params.ground.alpha, 1.0):
+        engine.params = params.with_values({"ground.alpha": alpha})
         engine.relabel(engine.step(scan, samples))
     engine.close()

@@ -76,10 +76,7 @@ class Decoder:
         if int(times.max()) - earliest > np.iinfo(np.int32).max:
             return DroppedScan(base_ns, "its points are more than 2 s apart, too long for one scan")
         offsets_ns = (times - earliest).astype(np.int32)
-        scan = Scan(base_ns + earliest, points[:n].copy(), offsets_ns, intensity[:n].copy(), ring[:n].copy())
-        for array in (scan.points, scan.offsets_ns, scan.intensity, scan.ring):
-            array.setflags(write=False)
-        return scan
+        return Scan(base_ns + earliest, points[:n].copy(), offsets_ns, intensity[:n].copy(), ring[:n].copy())
 
     def _step(self, frame: Revolution, model: Model) -> float:
         """0.01 deg from block to block: the median, or what follows from the stated speed."""

@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
+from app.slam.kernels.small import copy, cross
+
 CELLS, EDGE_M = 128, 0.5
 """Cells along each side of the square, and the length of a cell's edge."""
 COUNT, MEAN, LOWEST, HIGHEST = range(4)
@@ -115,8 +117,8 @@ def find(seen, known, corner, p, sigma, cos_slope, heights, kinds, seeds):
     found = 0
     for k in range(count):
         if abs((cells[k] - chosen) @ plane) < sigma * np.linalg.norm(cells[k]):
-            seeds[found] = cells[k]
-            queue[found] = index[k]
+            copy(cells[k], seeds[found])
+            copy(index[k], queue[found])
             i, j = index[k]
             heights[i, j], kinds[i, j] = height[i, j], PLANE
             found += 1
@@ -194,8 +196,9 @@ def _lowest_plane(cells, sigma, cos_slope):
     for _ in range(_TRIALS):
         for k in range(3):
             state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            corners[k] = cells[int(state >> np.uint64(33)) % len(cells)]
-        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            copy(cells[int(state >> np.uint64(33)) % len(cells)], corners[k])
+        normal = np.empty(3)
+        cross(corners[1] - corners[0], corners[2] - corners[0], normal)
         size = np.linalg.norm(normal)
         if size < 1e-6 or abs(normal[2]) < cos_slope * size:
             continue

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from app.slam.kernels.small import cross, rotation
+from app.slam.kernels.small import copy, cross, rotation
 
 
 @njit(cache=True)
@@ -102,22 +102,22 @@ SIZE = 36
 @njit(cache=True)
 def boxplus(x, d, out):
     """out = x [+] d, for packed states (SIZE,) and an error d (23,)."""
-    out[0:9] = (x[0:9].reshape(3, 3) @ exp(d[0:3])).ravel()
-    out[9:21] = x[9:21] + d[3:15]
+    np.dot(x[0:9].reshape(3, 3), exp(d[0:3]), out[0:9].reshape(3, 3))
+    np.add(x[9:21], d[3:15], out[9:21])
     g = x[21:24]
-    out[21:24] = exp(tangent_basis(g) @ d[15:17]) @ g
-    out[24:33] = (x[24:33].reshape(3, 3) @ exp(d[17:20])).ravel()
-    out[33:36] = x[33:36] + d[20:23]
+    np.dot(exp(tangent_basis(g) @ d[15:17]), g, out[21:24])
+    np.dot(x[24:33].reshape(3, 3), exp(d[17:20]), out[24:33].reshape(3, 3))
+    np.add(x[33:36], d[20:23], out[33:36])
 
 
 @njit(cache=True)
 def boxminus(a, b, d):
     """d (23,) with b [+] d = a, for packed states (SIZE,)."""
-    d[0:3] = log(b[0:9].reshape(3, 3).T @ a[0:9].reshape(3, 3))
-    d[3:15] = a[9:21] - b[9:21]
-    d[15:17] = tangent_basis(b[21:24]).T @ turn(b[21:24], a[21:24])
-    d[17:20] = log(b[24:33].reshape(3, 3).T @ a[24:33].reshape(3, 3))
-    d[20:23] = a[33:36] - b[33:36]
+    copy(log(b[0:9].reshape(3, 3).T @ a[0:9].reshape(3, 3)), d[0:3])
+    np.subtract(a[9:21], b[9:21], d[3:15])
+    np.dot(tangent_basis(b[21:24]).T, turn(b[21:24], a[21:24]), d[15:17])
+    copy(log(b[24:33].reshape(3, 3).T @ a[24:33].reshape(3, 3)), d[17:20])
+    np.subtract(a[33:36], b[33:36], d[20:23])
 
 
 @njit(cache=True)
@@ -133,22 +133,23 @@ def gauss_newton(x, prior, information, H, b, covariance, step, out):
     d = np.empty(23)
     boxminus(x, prior, d)
     J = np.eye(n)
-    J[0:3, 0:3] = right_jacobian_inverse(d[0:3])
-    J[15:17, 15:17] = tangent_basis(prior[21:24]).T @ tangent_basis(x[21:24])
+    copy(right_jacobian_inverse(d[0:3]), J[0:3, 0:3])
+    copy(tangent_basis(prior[21:24]).T @ tangent_basis(x[21:24]), J[15:17, 15:17])
     if n > 17:
-        J[17:20, 17:20] = right_jacobian_inverse(d[17:20])
+        copy(right_jacobian_inverse(d[17:20]), J[17:20, 17:20])
     to_pose = np.eye(6, n)
     if n > 17:  # an error of the extrinsics moves the points as an error of the pose does
         R, R_il = x[0:9].reshape(3, 3), x[24:33].reshape(3, 3)
-        to_pose[0:3, 17:20], to_pose[3:6, 20:23] = R_il, R
+        copy(R_il, to_pose[0:3, 17:20])
+        copy(R, to_pose[3:6, 20:23])
         lever = np.empty(3)
         for i in range(3):
             cross(x[33:36], R_il[:, i], lever)
-            to_pose[3:6, 17 + i] = R @ lever
+            copy(R @ lever, to_pose[3:6, 17 + i])
     A = J.T @ information @ J + to_pose.T @ H @ to_pose
     r = J.T @ (information @ d[:n]) + to_pose.T @ b
     inverse = np.linalg.inv(A)
-    covariance[:] = 0.5 * (inverse + inverse.T)
-    step[:] = 0.0
-    step[:n] = -(covariance @ r)
+    np.multiply(0.5, inverse + inverse.T, covariance)
+    step[n:] = 0.0
+    np.negative(covariance @ r, step[:n])
     boxplus(x, step, out)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from app.slam.kernels.small import cross, rotation
+from app.slam.kernels.small import copy, cross, rotation
 
 
 @njit(cache=True)
@@ -44,7 +44,7 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
         F[:] = 0.0
         rotation(-w[0] * dt, -w[1] * dt, -w[2] * dt, dR)
         rotation(0.5 * w[0] * dt, 0.5 * w[1] * dt, 0.5 * w[2] * dt, Rm)
-        Rn[:] = R @ Rm
+        np.dot(R, Rm, Rn)
         for i in range(3):
             for j in range(3):
                 F[i, j] = dR[i, j]
@@ -60,8 +60,8 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
             cross(B[:, j], g, aw)  # -[g]x b = b x g
             for i in range(3):
                 F[6 + i, 15 + j] = aw[i] * dt
-        P[:9] = F @ P
-        P[:, :9] = P @ F.T
+        copy(F @ P, P[:9])
+        copy(P @ F.T, P[:, :9])
         ng, na = noise[0], noise[4] if bridged[s] else noise[1]
         for i in range(3):
             P[i, i] += ng * ng * dt
@@ -83,9 +83,8 @@ def propagate(times, gyro, accel, bridged, coasting, max_step, R, p, v, bg, ba, 
                 for i in range(3):
                     a[i] = -(R[0, i] * g[0] + R[1, i] * g[1] + R[2, i] * g[2])
             rotation(0.5 * w[0] * h, 0.5 * w[1] * h, 0.5 * w[2] * h, dR)
-            Rm[:] = R @ dR
-            Rn[:] = Rm @ dR
-            R[:] = Rn
+            np.dot(R, dR, Rm)
+            np.dot(Rm, dR, R)
             for i in range(3):
                 aw[i] = Rm[i, 0] * a[0] + Rm[i, 1] * a[1] + Rm[i, 2] * a[2] + g[i]
                 p[i] += v[i] * h + 0.5 * aw[i] * h * h

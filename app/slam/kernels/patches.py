@@ -1,5 +1,6 @@
 """Planes through the neighbourhoods of a cloud's points."""
 
+import numpy as np
 from numba import njit
 
 from app.slam.kernels.small import plane_of
@@ -37,4 +38,4 @@ def planes(points, neighbours, eyes, thickness, normals, flat):
         for c in range(3):
             towards += normal[c] * (eyes[i, c] - points[i, c])
         if towards < 0.0:
-            normal[:] = -normal
+            np.negative(normal, normal)
