@@ -1,20 +1,21 @@
-"""A recording as calibration needs it: scans thinned to a few thousand points, and all IMU samples."""
+"""A recording as calibration needs it: what the engine gets of it, its scans thinned to a few thousand points."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.sensors.recording import ImuEntry, Recording, ScanEntry
+from app.sensors.recording import Recording
 from app.slam import rest
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import F64, I64, ImuSamples, Scan
+from app.slam.types import F64, I64, ImuSamples, Measurement, Scan
 from app.slam.voxel import VoxelGrid
 
 LONGEST_S = 120.0
 """More of a recording costs time and adds little."""
+PAUSE_NS = 5_000_000_000
+"""Scans farther apart than this do not belong together."""
 LEAST_SCANS = 50
 REST_S = 1.0
 VOXEL = 0.3
@@ -60,29 +61,32 @@ def read_excerpt(
     Raises:
         HemislamError: too short, or damaged from the start.
     """
-    scans: list[Scan] = []
-    stamps: list[int] = []
-    values: list[tuple[float, ...]] = []
+    measurements: list[Measurement] = []
     grid = VoxelGrid()
-    stop_ns = recording.start_ns + round(duration_s * 1e9)
-    for entry in recording.entries(None, stop_ns):
-        if isinstance(entry, ImuEntry):
-            stamps.append(entry.stamp_ns)
-            values.append((*entry.gyro, *entry.accel))
-        elif isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan) and entry.scan.end_ns < stop_ns:
-            scans.append(_thinned(entry.scan, params, grid))
-            progress(min((entry.scan.end_ns - recording.start_ns) / min(duration_s, recording.duration_s) * 1e-9, 1.0))
-    scans.sort(key=lambda scan: scan.end_ns)
-    usable = [after for before, after in pairwise(scans) if after.end_ns > before.end_ns and len(after)]
-    if len(usable) < LEAST_SCANS or len(stamps) < 10:
+    for entry in recording.measurements(0.0, duration_s):
+        if isinstance(entry, Measurement):
+            measurements.append(replace(entry, scan=_thinned(entry.scan, params, grid)))
+            read_s = (entry.scan.end_ns - recording.start_ns) * 1e-9
+            progress(min(max(read_s / min(duration_s, recording.duration_s), 0.0), 1.0))
+    measurements = _longest_part(measurements)
+    usable = [measurement.scan for measurement in measurements[1:] if len(measurement.scan)]
+    imu = _samples(measurements)
+    if len(usable) < LEAST_SCANS or len(imu) < 10:
         raise HemislamError(
-            f"{recording.path} has {len(usable)} usable scans and {len(stamps)} IMU samples; calibration needs"
+            f"{recording.path} has {len(usable)} usable scans and {len(imu)} IMU samples; calibration needs"
             f" at least {LEAST_SCANS} scans, better 30 s of lively motion."
         )
-    imu = _samples(stamps, values)
     begin_ns = _sets_off_ns(imu)
     lines = 1 + max(int(scan.ring.max()) for scan in usable) if recording.has_lines else 0
     return Excerpt(tuple(scan for scan in usable if scan.end_ns >= begin_ns), imu, lines)
+
+
+def _longest_part(measurements: list[Measurement]) -> list[Measurement]:
+    """The longest part between pauses and steps of the clock."""
+    ends_ns = np.array([measurement.scan.end_ns for measurement in measurements], np.int64)
+    edges = np.r_[0, np.flatnonzero(np.diff(ends_ns) > PAUSE_NS) + 1, len(ends_ns)]
+    longest = int(np.argmax(np.diff(edges)))
+    return measurements[edges[longest] : edges[longest + 1]]
 
 
 def _sets_off_ns(imu: ImuSamples) -> int:
@@ -97,13 +101,12 @@ def _sets_off_ns(imu: ImuSamples) -> int:
     return int(imu.stamps_ns[0])
 
 
-def _samples(stamps: list[int], values: list[tuple[float, ...]]) -> ImuSamples:
-    """In order of time, each once, without those that no IMU measures."""
-    rows = np.array(values, np.float64)
-    times, first = np.unique(np.array(stamps, np.int64), return_index=True)
-    rows = rows[first]
-    good = np.isfinite(rows).all(axis=1) & rows[:, 3:].any(axis=1)
-    return ImuSamples(times[good], rows[good, :3], rows[good, 3:])
+def _samples(measurements: list[Measurement]) -> ImuSamples:
+    """Each once; those of the first measurement may come from before a pause, and are left out."""
+    parts = [measurement.imu for measurement in measurements[1:]] or [m.imu for m in measurements]
+    stamps_ns, first = np.unique(np.concatenate([part.stamps_ns for part in parts]), return_index=True)
+    gyro, accel = (np.concatenate([getattr(part, name) for part in parts]) for name in ("gyro", "accel"))
+    return ImuSamples(stamps_ns, gyro[first], accel[first])
 
 
 def _thinned(scan: Scan, params: Params, grid: VoxelGrid) -> Scan:

@@ -20,7 +20,7 @@ from app.slam.sections import ImuParams
 from app.slam.types import I64, DroppedScan, ImuSamples, Measurement, Samples, Scan, Vector
 
 OUTAGE_NS = 1_000_000_000
-"""A sample that comes more than this after the one before must be confirmed by the next."""
+"""The first sample, and one that comes more than this after the one before, must be confirmed by the next."""
 
 MAX_WAITING = 64
 """Scans that wait for IMU samples at most; bounds the memory when the IMU falls silent."""
@@ -50,6 +50,7 @@ class Counts:
 
     imu_duplicates: int = 0
     imu_back_steps: int = 0
+    imu_far_off: int = 0
     imu_invalid: int = 0
     imu_weightless: int = 0
     imu_out_of_range: int = 0
@@ -87,7 +88,7 @@ class Sequencer:
     _told_silence_ns: int = -1
     """Last sample before the gap, and before the silence without an end, that was told last."""
     _suspect: tuple[int, tuple[float, ...]] | None = None
-    """A sample stamped far ahead of the one before: a wrong stamp, unless the next one goes on from there."""
+    """The first sample, or one stamped far ahead of the one before: a wrong stamp, unless the next goes on from it."""
     _usual: list[float] = field(default_factory=lambda: [0.0, 0.0])
     """How far samples usually are from the line between their neighbours: rad/s, m/s^2."""
     _begun: bool = False
@@ -126,15 +127,16 @@ class Sequencer:
             self._count("imu_out_of_range", "an IMU sample is beyond what an IMU can measure and was left out")
             return
         newest = self._stamps[-1] if self._stamps else None
-        if newest is not None and stamp_ns > newest + OUTAGE_NS and not self._confirms(stamp_ns):
+        suspect, self._suspect = self._suspect, None
+        confirmed = suspect is not None and 0 < stamp_ns - suspect[0] <= OUTAGE_NS
+        doubtful = newest is None or stamp_ns > newest + OUTAGE_NS
+        if suspect is not None and doubtful and confirmed:
+            self._append(*suspect)
+        elif suspect is not None and suspect[0] != stamp_ns:
+            self._count("imu_far_off", "an IMU sample was stamped far from those around it and was left out")
+        if doubtful and not confirmed:
             self._suspect = (stamp_ns, values)
             return
-        if self._suspect is not None:
-            suspect, self._suspect = self._suspect, None
-            if newest is not None and stamp_ns > newest + OUTAGE_NS:
-                self._append(*suspect)
-            else:
-                self._count("imu_back_steps", "an IMU sample was stamped far ahead of its time and was left out")
         if newest is not None and stamp_ns <= newest:
             if stamp_ns == newest:
                 self.counts.imu_duplicates += 1
@@ -145,10 +147,6 @@ class Sequencer:
             return
         self._behind = False
         self._append(stamp_ns, values)
-
-    def _confirms(self, stamp_ns: int) -> bool:
-        """Whether this sample goes on where the one far ahead was: then time did go on while the IMU was silent."""
-        return self._suspect is not None and 0 < stamp_ns - self._suspect[0] <= OUTAGE_NS
 
     def _append(self, stamp_ns: int, values: tuple[float, ...]) -> None:
         if self._stamps:

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from app.__main__ import cli
 from app.calibration.calibrate import MirroredError, calibrate, calibrate_excerpt
 from app.calibration.excerpt import Excerpt, read_excerpt
+from app.calibration.inertial import Noise
 from app.calibration.lines import Lines
 from app.calibration.odometry import track
 from app.calibration.words import WALK, as_json, table, write_beside
@@ -189,6 +190,24 @@ def test_numbers_for_programs_are_json_and_the_plot_is_an_image(tmp_path: Path) 
     assert json.loads(json.dumps(as_json(found)))["observed"]["rotation"] is True
     drawn = ElementTree.fromstring(residual_plot(found))
     assert drawn.tag.endswith("svg") and len(list(drawn.iter("{http://www.w3.org/2000/svg}polyline"))) == 4
+
+
+def test_numbers_that_are_not_known_are_no_numbers() -> None:
+    unknown = replace(known(Path("walk.mcap")), gyro_noise=Noise(np.nan, np.nan))
+    assert json.loads(json.dumps(as_json(unknown), allow_nan=False))["gyro_noise"] == [None, None]
+    assert ("noise of the gyroscope", "not known: it takes four seconds of evenly spaced samples") in table(unknown)
+
+
+def test_samples_that_no_imu_measures_do_not_reach_it(tmp_path: Path) -> None:
+    """A spike of the gyroscope, and a first sample stamped 0."""
+    entries = rig.walk(turns=70, columns=4)
+    of_imu = [sent for topic, _, sent in entries if topic == "/imu"]
+    of_imu[0].header = rig.header(0, 2)
+    of_imu[300].angular_velocity.x = 300.0
+    with open_recording(rig.write(tmp_path / "walk", entries), Params()) as recording:
+        excerpt = read_excerpt(recording, Params())
+    assert np.abs(excerpt.imu.gyro).max() < 1.0 and excerpt.imu.stamps_ns[0] > rig.START_NS - 10**9
+    assert len(excerpt.scans) > 60
 
 
 def test_a_recording_that_is_too_short_is_refused_in_a_sentence(shared_data: Path) -> None:

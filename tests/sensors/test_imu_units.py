@@ -64,6 +64,14 @@ def test_a_gyroscope_in_degrees_is_suspected_at_rest_and_corrected_once_it_is_ca
     assert findings[-1].verdict == "corrected"
 
 
+def test_a_repeated_stamp_does_not_hide_a_gyroscope_in_degrees() -> None:
+    walk = carried()
+    stamps = walk.stamps_ns.copy()
+    stamps[2000] = stamps[1999]
+    units, findings = settle_imu(ImuProbe(stamps, stamps, np.degrees(walk.gyro), walk.accel), RecordingParams())
+    assert units.gyro[0][1] == pytest.approx(np.pi / 180) and "deg/s" in findings[-1].text
+
+
 def test_an_imu_in_order_is_left_as_it_is() -> None:
     units, findings = settle_imu(carried(), RecordingParams())
     assert units == AS_RECORDED and {finding.verdict for finding in findings} == {"fine"}

@@ -265,7 +265,18 @@ def test_one_sample_stamped_far_ahead_does_not_silence_the_rest() -> None:
     sequencer.add_scan(scan(100))
     first, second = sequencer.ready()
     assert stamps(first) == samples(0, 100) and stamps(second) == samples(100, 200)
-    assert isinstance(first, Measurement) and "far ahead" in first.notices[0]
+    assert isinstance(first, Measurement) and "stamped far from" in first.notices[0]
+
+
+@pytest.mark.parametrize("wrong_ms", [-1_000_000, 60_000])
+def test_a_first_sample_with_a_wrong_stamp_does_not_silence_the_rest(wrong_ms: int) -> None:
+    sequencer = Sequencer(ImuParams())
+    for at in [wrong_ms, *samples(0, 310)]:
+        push(sequencer, at)
+    sequencer.add_scan(scan(100))
+    sequencer.add_scan(scan(200))
+    assert [stamps(entry) for entry in sequencer.ready()] == [samples(0, 200), samples(200, 300)]
+    assert (sequencer.counts.imu_far_off, sequencer.counts.longest_imu_gap_s) == (1, 0.0)
 
 
 def test_the_imu_goes_on_after_an_outage_of_many_seconds() -> None:
