@@ -50,7 +50,7 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
     """The same as numbers; units as in the parameters, standard deviations in rad, s, m, rad/s and m/s²; of the noise
     density and its standard deviation."""
     c = calibration
-    return {
+    numbers: dict[str, Any] = {
         "recording": str(c.recording),
         "used_s": c.lasted_s,
         "rotation_deg": list(c.rotation),
@@ -65,7 +65,7 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
             "elevations_rad": c.lines.elevations.tolist(),
             "ranges_m": c.lines.ranges.tolist(),
             "sigmas": c.lines.sigmas.tolist(),
-            "residuals_m": finite([c.lines.before.tolist(), c.lines.after.tolist()]),
+            "residuals_m": [c.lines.before.tolist(), c.lines.after.tolist()],
         },
         "sigmas": {name: values.tolist() for name, values in c.sigmas.items()},
         "observed": c.observed,
@@ -77,6 +77,7 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
         "parameters": c.found(),
         "contradiction": c.contradiction(),
     }
+    return {name: finite(value) for name, value in numbers.items()}
 
 
 def write_beside(recording: Path, found: Mapping[str, Any], *, replace: bool = False) -> Path:
@@ -141,6 +142,8 @@ def _vector(values: np.ndarray, sigmas: np.ndarray, unit: str) -> str:
 
 
 def _noise(noise: Noise, scale: float, unit: str) -> str:
+    if not np.isfinite(noise.density):
+        return "not known: it takes four seconds of evenly spaced samples"
     return f"{noise.density * scale:.2f} ± {noise.sigma * scale:.2f} {unit}"
 
 

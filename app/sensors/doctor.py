@@ -26,6 +26,7 @@ from app.slam.pause import PAUSE_S
 from app.slam.sections import ImuParams
 from app.slam.types import F64, I64, DroppedScan, Scan
 
+MOST_IN_BATCH = 50
 DAMAGE = "file"
 """Subject of what is wrong with the file itself."""
 
@@ -150,9 +151,19 @@ def _topics(topics: tuple[Topic, ...], duration_s: float) -> Finding:
 
 def _rate(subject: str, stamps: I64, least: float) -> Finding:
     steps = np.diff(stamps)
-    steps = steps[steps > 0]
-    if not len(steps):
+    steps = steps[steps >= 0]
+    if not steps.any():
         return Finding(subject, "needs you", "too few messages to determine it")
+    usual = float(np.median(steps))
+    mean = float(np.mean(steps[steps <= max(usual, PAUSE_S * 1e9)]))
+    batches = int(np.count_nonzero(steps > 2.0 * mean))
+    if usual < 0.5 * mean and len(steps) < MOST_IN_BATCH * batches:
+        text = (
+            f"{1e9 / mean:.2f} Hz on average, but stamped in batches of {len(steps) / batches:.0f}: the driver has to "
+            "stamp each sample when it is measured, not when it is read"
+        )
+        return Finding(subject, "needs you", text)
+    steps = steps[steps > 0]
     rate = 1e9 / float(np.median(steps))
     spread = (np.percentile(steps, 99) - np.percentile(steps, 1)) / 1e6
     text = f"{rate:.2f} Hz, {len(stamps)} messages; 98 % of the intervals within {spread:.2f} ms"
@@ -199,6 +210,7 @@ def _imu_gaps(counts: Counts, limit_s: float, pauses: int) -> Finding:
 def _imu_time(counts: Counts) -> Finding:
     wrong = _listed(
         (counts.imu_back_steps, "steps back"),
+        (counts.imu_far_off, "stamps far from those around them"),
         (counts.imu_duplicates, "repeated stamps"),
         (counts.imu_invalid, "NaN samples"),
     )

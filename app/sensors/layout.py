@@ -47,6 +47,9 @@ def settle_cloud(
     spin = None
     if timing.field is None:
         spin = settle_spin(clouds, timing.period_ns / 1e9)
+        if not spin.ordered:
+            text = f"{time_findings[0].text}; but the order of the points shows no rotation, so this is a guess"
+            time_findings[0] = replace(time_findings[0], verdict="needs you", text=text)
         if spin.start is None:  # then only the cloud's own first or last point can be at the header stamp
             timing = replace(timing, anchor="last" if timing.shift_ns else "first", shift_ns=0)
     else:

@@ -102,11 +102,17 @@ def line_findings(scans: list[Scan], has_lines: bool, params: SensorParams) -> l
     """Corrections of scan lines that are not as many as the lines of a recording's first scans."""
     found, lines = [], 1 + max(int(scan.ring.max()) for scan in scans if len(scan)) if has_lines else 0
     for name in ("elevation_corrections", "range_corrections"):
-        if (given := len(getattr(params, name).split())) not in (0, lines):
+        given = len(getattr(params, name).split())
+        if given and not lines <= given <= _all_lines(lines):
             there = f"the LiDAR has {lines} scan lines" if has_lines else "the LiDAR has no scan lines"
             text = f"`sensor.{name}` holds {given} numbers, but {there}; take those of this LiDAR, or none"
             found.append(Finding("scan lines", "needs you", text, f'--set sensor.{name}=""'))
     return found
+
+
+def _all_lines(seen: int) -> int:
+    """How many lines a sensor probably has of which so many were seen: some may see nothing but sky at first."""
+    return next((lines for lines in (8, *_COMMON_LINES) if lines >= seen), seen) if seen else 0
 
 
 def _settle_steps(points: F32, why: str) -> tuple[Rings, Finding]:
@@ -133,6 +139,7 @@ def _settle_field(field: str, raw: I64, angles: F32, lines: int) -> tuple[Rings,
             "ring order", "fine", f"`{field}` counts {lines} scan lines from the lowest elevation up ({span})"
         )
     if share <= 0.1:
+        lines = _all_lines(lines)
         rank = np.arange(lines - 1, -1, -1, dtype=np.uint16)
         text = f"`{field}` counts {lines} scan lines from the highest elevation down ({span}); reversed"
         return Rings(field, rank=rank), Finding("ring order", "corrected", text)

@@ -138,10 +138,13 @@ def _settle_reference(
         return timing, _absolute_findings(to_first, to_last, period_ns, chosen, near)
     header, stamp_finding = _settle_header(clouds, least, most, period_ns, chosen)
     if small:
-        shift = 0
-        if header == "first" and min(least) < -0.1 * period_ns:
+        shift, before, after = 0, min(least) < -0.1 * period_ns, max(most) > 0.1 * period_ns
+        if before and after and chosen.header_stamp == "auto":
+            text = "of a point within the scan: the points' times count from it, both ways"
+            stamp_finding = Finding("header stamp", "fine", text)
+        elif header == "first" and before:
             shift = -min(least)
-        elif header == "last" and max(most) > 0.1 * period_ns:
+        elif header == "last" and after:
             shift = -max(most)
         timing = Timing(name, unit_ns, "header", shift, period_ns)
         text = f"`{name}` counts from the header stamp (it stays below a scan)"

@@ -39,6 +39,19 @@ def test_rates_are_those_of_the_sensors(tmp_path: Path) -> None:
     assert found["IMU rate"].verdict == "needs you"
 
 
+def test_samples_that_are_stamped_when_they_are_read_are_named(tmp_path: Path) -> None:
+    entries = rig.walk(turns=20, columns=4, imu_period_ns=5_000_000)
+    samples = iter(range(10_000))
+    for topic, _, sent in entries:
+        if topic == "/imu":
+            number = next(samples)
+            late_ns = (9 - number % 10) * 4_900_000
+            sent.header = rig.header(rig.START_NS - 50_000_000 + number * 5_000_000 + late_ns, 2)
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert found["IMU rate"].verdict == "needs you"
+    assert "20" in found["IMU rate"].text and "Hz on average, but stamped in batches of 10" in found["IMU rate"].text
+
+
 def test_outages_steps_back_and_missing_scans_are_counted(tmp_path: Path) -> None:
     entries = rig.walk(turns=20, columns=4)
     stamp = {

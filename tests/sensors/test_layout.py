@@ -9,8 +9,10 @@ from app.sensors.cloud_types import Probe, read_point_cloud_2
 from app.sensors.findings import Finding
 from app.sensors.layout import settle_cloud
 from app.sensors.pointcloud import CloudLayout, decode
+from app.sensors.rings import line_findings
 from app.slam.errors import HemislamError
-from app.slam.sections import RecordingParams
+from app.slam.sections import RecordingParams, SensorParams
+from app.slam.types import Scan
 from tests.sensors import rig
 
 XYZ = [("x", "f4", "x"), ("y", "f4", "y"), ("z", "f4", "z")]
@@ -76,6 +78,20 @@ def test_negative_times_lead_up_to_the_header() -> None:
     layout, findings = settle(probes)
     assert time_error_ns(probes[0], layout) < 1_000
     assert "negative" in findings["header stamp"].text
+
+
+@pytest.mark.parametrize("within", [0.3, 0.5])
+def test_times_before_and_after_the_header_count_from_it(within: float) -> None:
+    ahead_ns = round((1.0 - within) * rig.PERIOD_NS)
+    probes = []
+    for number in range(4):
+        made = rig.turn(number, columns=20)
+        later = replace(made, begin_ns=made.begin_ns - ahead_ns)  # its end is then where the header is to be
+        message = rig.message(replace(later, offsets_ns=made.offsets_ns + ahead_ns), relative(time_from="last"))
+        probes.append(Probe(made.begin_ns + rig.PERIOD_NS + 3_000_000, read_point_cloud_2(message)))
+    layout, findings = settle(probes)
+    assert time_error_ns(probes[0], layout) < 1_000
+    assert "within the scan" in findings["header stamp"].text
 
 
 def test_a_log_time_copied_from_the_header_is_no_evidence_about_it() -> None:
@@ -179,6 +195,17 @@ def test_a_line_that_sees_nothing_for_most_of_a_turn_still_gets_its_times() -> N
     assert error.max() < 8 * FIRING_NS
 
 
+def test_points_without_times_in_no_order_of_rotation_are_named() -> None:
+    probes, rng = [], np.random.default_rng(0)
+    for number in range(4):
+        made = rig.turn(number, columns=20)
+        shuffled = made.only(rng.permutation(len(made)))
+        cloud = read_point_cloud_2(rig.message(shuffled, rig.Layout([*XYZ, RING])))
+        probes.append(Probe(made.begin_ns + rig.PERIOD_NS + 3_000_000, cloud))
+    _, findings = settle(probes)
+    assert findings["point time"].verdict == "needs you" and "no rotation" in findings["point time"].text
+
+
 def test_a_rotation_rate_that_contradicts_the_clouds_is_named() -> None:
     _, findings = settle(clouds(rig.Layout([*XYZ, RING])), rotation_rate=20.0)
     assert findings["point time"].verdict == "needs you"
@@ -195,6 +222,26 @@ def test_rings_counted_from_the_top_are_turned_round() -> None:
     layout, findings = settle(probes)
     np.testing.assert_array_equal(decode(probes[0].cloud, layout).ring, truth)
     assert findings["ring order"].verdict == "corrected"
+
+
+def test_lines_that_see_only_sky_at_first_are_counted_all_the_same() -> None:
+    """Of eight lines counted from the top, the two lowest see nothing yet."""
+    probes, made = [], rig.turn(columns=20)
+    for number in range(4):
+        made = rig.turn(number, columns=20)
+        made.ring = 7 - made.ring
+        probes.append(Probe(made.begin_ns, read_point_cloud_2(rig.message(made.only(made.ring < 6)))))
+    layout, findings = settle(probes)
+    assert "8 scan lines from the highest elevation down" in findings["ring order"].text
+    np.testing.assert_array_equal(decode(read_point_cloud_2(rig.message(made)), layout).ring, 7 - made.ring)
+
+
+@pytest.mark.parametrize(("seen", "given", "wrong"), [(6, 8, False), (6, 12, True), (20, 32, False), (32, 20, True)])
+def test_corrections_are_for_as_many_lines_as_the_lidar_may_have(seen: int, given: int, wrong: bool) -> None:
+    rings = np.arange(seen, dtype=np.uint16)
+    scan = Scan(0, np.ones((seen, 3), np.float32), np.zeros(seen, np.int32), np.zeros(seen, np.float32), rings)
+    params = SensorParams(elevation_corrections=" ".join(["0.1"] * given))
+    assert bool(line_findings([scan], True, params)) is wrong
 
 
 def test_rings_in_firing_order_are_ranked_by_elevation() -> None:
