@@ -48,6 +48,8 @@ from app.slam.text_files import free_path, make_folder, write_texts
 log = logging.getLogger(__name__)
 
 SUFFIX = ".hemislam"
+FORKS, FORK_START = "forks", f"start{SUFFIX}"
+"""Below the folder of session files, folders of forks; and in each the file that the fork began with."""
 FORMAT = 2
 MOST_POINTS = 1 << 24
 """Of a keyframe: far more than any scan has."""
@@ -293,9 +295,10 @@ def read_marks(path: Path) -> tuple[tuple[int, bytes], ...]:
 
 
 def session_files(folder: Path) -> list[Path]:
-    """Those in a folder, the newest first."""
+    """Those in a folder and of its forks, the newest first."""
     found = []
-    for path in folder.glob(f"*{SUFFIX}"):
+    of_forks = (path for path in folder.glob(f"{FORKS}/*/*{SUFFIX}") if path.name != FORK_START)
+    for path in (*folder.glob(f"*{SUFFIX}"), *of_forks):
         with contextlib.suppress(OSError):  # it has gone meanwhile
             found.append((path.stat().st_mtime_ns, path))
     return [path for _, path in sorted(found, reverse=True)]

@@ -16,6 +16,8 @@ from typing import Any
 
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.session_file import (
+    FORK_START,
+    FORKS,
     SUFFIX,
     SavedSession,
     read_session,
@@ -31,8 +33,6 @@ from app.slam.errors import HemislamError
 from app.slam.text_files import free_path
 
 MAIN = "main"
-FOLDER = "forks"
-"""Below the folder of session files: forks that are neither kept nor discarded."""
 PERIOD_S = 0.02
 """How often to look where A is."""
 AGAIN_S = 1.0
@@ -153,7 +153,7 @@ class Workspace:
         with self._lock:
             a, folder = self._place(name)
             session = forked(a.engine.snapshot, values or {})
-            file = folder / f"start{SUFFIX}"
+            file = folder / FORK_START
             write_session(file, session)
             self._begin(file, session, name, folder, session.frame)
             changed = ", ".join(f"{path} = {value}" for path, value in (values or {}).items())
@@ -176,8 +176,8 @@ class Workspace:
         a, folder = self._sides[0].engine.snapshot, self._setup.session_folder
         if folder is None or a.recording is None:
             return []
-        ours = a.session_file.name if a.session_file is not None else ""
-        others = [file for file in session_files(folder) if file.name != ours][:_MOST_KEPT]
+        ours = a.session_file.resolve() if a.session_file is not None else None
+        others = [file for file in session_files(folder) if file.resolve() != ours][:_MOST_KEPT]
         return [file for file in others if recording_of(file) == a.recording.path.resolve()]
 
     def swap(self) -> None:
@@ -213,7 +213,7 @@ class Workspace:
         """
         with self._lock:
             b = self._end()
-            session_file = b.engine.snapshot.session_file or (b.folder / f"start{SUFFIX}" if b.folder else None)
+            session_file = b.engine.snapshot.session_file or (b.folder / FORK_START if b.folder else None)
             if session_file is None or self._setup.session_folder is None:
                 raise HemislamError("B has no session file.")
             session = read_session(session_file)
@@ -245,7 +245,7 @@ class Workspace:
             raise HemislamError(_NOT_KEPT)
         self._forks += 1
         stamp = f"{datetime.now():%Y%m%d-%H%M%S}"
-        return a, free_path(self._setup.session_folder / FOLDER / f"{stamp}-{_plain(name.strip())}")
+        return a, free_path(self._setup.session_folder / FORKS / f"{stamp}-{_plain(name.strip())}")
 
     def _begin(self, file: Path, session: SavedSession, name: str, folder: Path, forked_at: int) -> None:
         engine = self._start(

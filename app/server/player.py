@@ -149,11 +149,13 @@ class Player:
         self._aim(session, frame, frame if frame < max(session.heading, session.frame) else None, stepping=True)
 
     def seek(self, session: Session, frame: int) -> None:
-        """Go to a frame, or to the end, as fast as possible, then go on as before. Raises HemislamError: it is live."""
+        """Go to a frame as fast as possible, then go on as before; from the last one to the end, where loops are sought
+        once more. Raises HemislamError: it is live.
+        """
         if not session.feed.repeatable:
             raise HemislamError(ONLY_ON)
-        frame = max(0, frame)
-        self._aim(session, frame, frame)
+        frame, frames = max(0, frame), session.feed.info.frames
+        self._aim(session, frame + (frame + 1 == frames), frame)
 
     def resume(self, session: Session, frame: int, *, to_end: bool) -> None:
         """Go to the frame of a session file. to_end: and on to the end of the recording."""

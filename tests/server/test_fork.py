@@ -17,7 +17,7 @@ import server_fakes as fakes
 
 from app.mapping.kept import Note
 from app.mapping.opening import open_session
-from app.mapping.session_file import Opened, SessionWriter, State, read_session
+from app.mapping.session_file import Opened, SessionWriter, State, read_session, session_files
 from app.sensors.presets import resolve_params
 from app.server.fork import Workspace, follow, forked
 from app.server.keeping import AddNote
@@ -190,7 +190,10 @@ def test_a_fork_is_led_swapped_and_discarded(pair: Workspace, tmp_path: Path) ->
     kept = pair.snapshot.session_file
     pair.discard()
     assert pair.other is None and kept is not None and kept.exists(), "what A is now is not thrown away with the other"
-    assert list(tmp_path.glob("*.hemislam")), "nor is the first session"
+    (first_file,) = tmp_path.glob("*.hemislam")
+    assert session_files(tmp_path) == [kept, first_file], (
+        "what was used last is offered first; the start of a fork is not"
+    )
     until(lambda: pair.snapshot, lambda s: len(s.notes) == 2)
     assert [(note.frame, note.text.split()[0]) for note in pair.snapshot.notes][1:] == [
         (pair.snapshot.transport.frame, "Discarded")

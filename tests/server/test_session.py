@@ -115,8 +115,11 @@ def test_pause_ends_a_seek() -> None:
     assert snapshot.transport.frame == 10 and snapshot.progress is None
 
 
-def test_a_seek_beyond_the_end_goes_to_the_last_frame() -> None:
-    assert Bench().do(Seek(10_000)).transport.frame == 59
+@pytest.mark.parametrize("frame", [59, 10_000])
+def test_a_seek_to_the_last_frame_or_beyond_ends_the_recording(frame: int) -> None:
+    transport = Bench().do(Seek(frame)).transport
+    assert (transport.frame, transport.finished) == (59, True)
+    assert not Bench().do(Seek(58)).transport.finished
 
 
 def test_playing_a_finished_recording_goes_back_to_its_start_and_loses_nothing() -> None:
