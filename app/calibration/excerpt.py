@@ -94,9 +94,7 @@ def _sets_off_ns(imu: ImuSamples) -> int:
     rest_ns = round(REST_S * 1e9)
     for begin in range(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), rest_ns // 4):
         part = slice(*np.searchsorted(imu.stamps_ns, [begin, begin + rest_ns // 2]))
-        if part.stop - part.start > 3 and rest.is_moving(
-            ImuSamples(imu.stamps_ns[part], imu.gyro[part], imu.accel[part])
-        ):
+        if part.stop - part.start > 3 and rest.is_moving(imu.part(part)):
             return begin - rest_ns
     return int(imu.stamps_ns[0])
 

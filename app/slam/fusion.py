@@ -71,7 +71,8 @@ def _with_imu(prediction: Prediction, sampled: F32, local_map: LocalMap, params:
     registration = replace(registration, predicted_change=change, correction=correction)
     if registration.surprise > iekf.SURPRISING:  # once more, as if nothing were known of the speed
         open_speed = imu.with_open_speed(predicted, (predicted.state.stamp_ns - begin.stamp_ns) * 1e-9)
-        posterior, _ = _attempted(predicted, partial(iekf.update, open_speed, chosen, local_map, params.filter))
+        again, of_it = _attempted(predicted, partial(iekf.update, open_speed, chosen, local_map, params.filter))
+        posterior = again if of_it.inliers >= iekf.MIN_INLIERS else posterior
     return posterior, registration
 
 

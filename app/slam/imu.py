@@ -67,6 +67,13 @@ def mounting_to_pose(state: NavState) -> F64:
     return follows
 
 
+def seen_from_the_lidar(belief: Belief) -> Belief:
+    """The belief if the map begins at the LiDAR's pose: the IMU's is then as uncertain as the mounting between them."""
+    follows = np.eye(DIM)
+    follows[POSE, EXT] = mounting_to_pose(belief.state)
+    return Belief(belief.state, follows @ belief.covariance @ follows.T)
+
+
 def propagate(
     belief: Belief, imu: ImuSamples, end_ns: int, params: ImuParams, clock_sigma: float = USUAL_S
 ) -> tuple[Belief, Path]:

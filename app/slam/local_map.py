@@ -88,20 +88,21 @@ class LocalMap:
             self._way = np.r_[position, self._way[3] + step / DRIFT_M * residual**2]
         if np.linalg.norm(position - self._center) > 0.1 * params.radius:
             self._evict(position, params.radius)
-        self._used, refused = self._insert(points, position, params)
-        radius = params.radius
-        while refused and radius > 1.0:
+        refused, radius = self._insert(points, position, params), params.radius
+        while len(refused) and radius > 1.0:
             radius *= 0.8
             self._evict(position, radius)
-            points = points[np.linalg.norm(points - position, axis=1) < radius]
-            self._used, refused = self._insert(points, position, params)
+            near = refused[np.linalg.norm(refused - position, axis=1) < radius]
+            refused = self._insert(near, position, params)
 
-    def _insert(self, points: F32, position: F64, params: MapParams) -> tuple[int, int]:
-        used, refused = kernels.insert(
+    def _insert(self, points: F32, position: F64, params: MapParams) -> F32:
+        """Returns the points for which the map has no room."""
+        refused = np.empty(len(points), np.bool_)
+        self._used = int(kernels.insert(
             points, position, self._voxel, params.spacing, self._way[3], self._way[3] - OLD_M**2,
-            self._table, self._cells, self._counts, self._store, self._used,
-        )  # fmt: skip
-        return int(used), int(refused)
+            self._table, self._cells, self._counts, self._store, self._used, refused,
+        ))  # fmt: skip
+        return points[refused]
 
     def _evict(self, center: F64, radius: float) -> None:
         self._used = int(

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import coast, lie
-from app.slam.imu import BA, BG, DIM, EXT, GRAV, POS, ROT, VEL, WALKING, Belief
+from app.slam.imu import BA, BG, DIM, EXT, GRAV, POS, ROT, VEL, WALKING, Belief, seen_from_the_lidar
 from app.slam.kernels import manifold
 from app.slam.params import Params
+from app.slam.start import BEFORE_NS
 from app.slam.types import ImuSamples, Scan
 
 PAUSE_S = 1.5
@@ -58,12 +59,12 @@ def resumed(
     What is known of the sensors is kept. If the IMU is still silent, its earlier samples are returned, and if there is
     none, the rate of turn, which stands in for the gyroscope's bias (`coast`), is unknown again.
     """
-    state, later = last.state, samples.stamps_ns > pause.begin_ns
+    state, later = last.state, samples.stamps_ns > max(pause.begin_ns, scan.stamp_ns - BEFORE_NS)
     sigma = np.zeros(DIM)
     sigma[ROT] = sigma[POS] = 1e-4  # the map begins at this pose
     sigma[VEL], sigma[GRAV] = WALKING, TILTED
     if later.any():
-        samples = ImuSamples(samples.stamps_ns[later], samples.gyro[later], samples.accel[later])
+        samples = samples.part(later)
         up = samples.accel.mean(axis=0) - state.b_accel
     else:
         up = coast.begin(scan, params).state.R_odom_imu[2]
@@ -78,6 +79,8 @@ def resumed(
         g_odom=-np.linalg.norm(state.g_odom) * UP,
     )
     belief = Belief(here, covariance)
+    if params.filter.estimate_extrinsics:
+        belief = seen_from_the_lidar(belief)
     return (belief if len(samples) else coast.without_imu(belief)), samples
 
 

@@ -9,23 +9,23 @@ from app.slam.imu import (
     BA,
     BG,
     DIM,
-    EXT,
     EXT_POS,
     EXT_ROT,
     GRAV,
     POS,
-    POSE,
     ROT,
     VEL,
     WALKING,
     Belief,
-    mounting_to_pose,
+    seen_from_the_lidar,
 )
 from app.slam.params import Params
-from app.slam.types import F64, ImuSamples, NavState, Scan
+from app.slam.types import ImuSamples, NavState, Scan
 
 LEAST_STILL = 0.3
 """s; a shorter rest does not determine the gyroscope's bias."""
+BEFORE_NS = 100_000_000
+"""Earlier samples than this before the first scan do not count: the device may have lain elsewhere."""
 DRAWN = 0.007, 0.005
 """rad, m: standard deviations about and along each axis of a mounting from a drawing: 0.7 deg and 9 mm off in all."""
 
@@ -53,7 +53,8 @@ def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: P
         still: `Started.still` of the last call; None at the first scan.
         samples: IMU samples up to this scan's end.
     """
-    together = samples if still is None else _joined(still, samples)
+    recent = samples.part(samples.stamps_ns >= scan.stamp_ns - BEFORE_NS)
+    together = recent if still is None else _joined(still, samples)
     if not rest.is_moving(together):
         lasted_s = (together.stamps_ns[-1] - together.stamps_ns[0]) * 1e-9
         waiting = bool(lasted_s < params.imu.start_duration)
@@ -64,7 +65,7 @@ def proceed(still: ImuSamples | None, scan: Scan, samples: ImuSamples, params: P
         belief = standing(still, int(still.stamps_ns[-1]), params)
         return Started(belief, still, False, f"Started after only {lasted_s:.1f} s at rest.")
     notice = "The device was moving at the start: biases and gravity begin as rough guesses."
-    begin_ns = max(scan.stamp_ns, int(samples.stamps_ns[0]))
+    begin_ns = max(scan.stamp_ns, int(together.stamps_ns[0]))
     return Started(moving(together, begin_ns, params), together, False, notice)
 
 
@@ -109,18 +110,8 @@ def _belief(imu: ImuSamples, stamp_ns: int, b_gyro: np.ndarray, sigma: np.ndarra
         R_imu_lidar=lie.from_rpy_degrees(params.sensor.rotation),
         p_imu_lidar=np.array(params.sensor.translation, dtype=np.float64),
     )
-    covariance = np.diag(sigma**2)
-    if params.filter.estimate_extrinsics:
-        covariance = _seen_from_the_lidar(state, covariance)
-    return Belief(state, covariance)
-
-
-def _seen_from_the_lidar(state: NavState, covariance: F64) -> F64:
-    """The covariance (23, 23) if the LiDAR's first pose defines odom: the IMU's pose is then as uncertain as the
-    extrinsics between the two."""
-    follows = np.eye(DIM)
-    follows[POSE, EXT] = mounting_to_pose(state)
-    return np.asarray(follows @ covariance @ follows.T)
+    belief = Belief(state, np.diag(sigma**2))
+    return seen_from_the_lidar(belief) if params.filter.estimate_extrinsics else belief
 
 
 def _joined(a: ImuSamples, b: ImuSamples) -> ImuSamples:

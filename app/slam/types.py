@@ -104,6 +104,10 @@ class ImuSamples(Samples):
     gyro: F64
     accel: F64
 
+    def part(self, which: Mask | slice) -> "ImuSamples":
+        """Some of them, by a mask or a slice."""
+        return ImuSamples(self.stamps_ns[which], self.gyro[which], self.accel[which])
+
 
 @dataclass(frozen=True, slots=True)
 class Measurement:

@@ -1,5 +1,8 @@
 """What comes of a prediction and a scan. How exact it is: test_iekf, test_coast and test_engine_trouble."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,24 +13,42 @@ from app.slam.local_map import LocalMap
 from app.slam.params import Params
 from app.slam.prediction import Prediction
 from app.slam.sections import MapParams
-from app.slam.types import Scan
+from app.slam.types import Registration, Scan
 
 from .scenes import furnished_room
 from .updates import points_of, surveyed, truth, uncertain
 
 
-@pytest.mark.parametrize("covariance", [np.zeros((DIM, DIM)), np.full((DIM, DIM), np.nan)], ids=["singular", "nan"])
-def test_after_a_numerical_failure_the_prediction_stands_and_the_frame_is_lost(covariance: np.ndarray) -> None:
-    points, room = points_of(furnished_room()), surveyed(furnished_room())
+def fused(belief: Belief, local_map: LocalMap) -> Fused:
+    points = points_of(furnished_room())
     scan = Scan(0, points, *(np.zeros(len(points), kind) for kind in (np.int32, np.float32, np.uint16)))
     path = Path(np.array([-0.1, 0.0]), np.tile(np.eye(4)[:3], (2, 1, 1)))
+    prediction = Prediction(belief, belief, path, gap=False, course=None)
+    return fuse(prediction, scan, points, points, np.arange(len(points)), local_map, Params())
 
-    def fused(covariance: np.ndarray, local_map: LocalMap) -> Fused:
-        belief = Belief(truth(), covariance)
-        prediction = Prediction(belief, belief, path, gap=False, course=None)
-        return fuse(prediction, scan, points, points, np.arange(len(points)), local_map, Params())
 
-    failed, good, first = fused(covariance, room), fused(uncertain(), room), fused(uncertain(), LocalMap(MapParams()))
+def test_a_scan_that_fits_only_as_predicted_is_not_fused_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It contradicts the IMU; with the speed open, it meets too few planes."""
+    belief, room, real, done = Belief(truth(), uncertain()), surveyed(furnished_room()), iekf.update, []
+
+    def update(prior: Belief, *rest: Any) -> tuple[Belief, Registration]:
+        posterior, registration = real(prior, *rest)
+        done.append(posterior)
+        if len(done) == 1:
+            return posterior, replace(registration, surprise=2 * iekf.SURPRISING)
+        return prior, iekf.too_few(2, registration.used, 20, registration.matches)
+
+    monkeypatch.setattr(iekf, "update", update)
+    outcome = fused(belief, room)
+    assert len(done) == 2 and not outcome.lost
+    assert np.array_equal(outcome.belief.state.T_odom_imu, done[0].state.T_odom_imu)
+
+
+@pytest.mark.parametrize("covariance", [np.zeros((DIM, DIM)), np.full((DIM, DIM), np.nan)], ids=["singular", "nan"])
+def test_after_a_numerical_failure_the_prediction_stands_and_the_frame_is_lost(covariance: np.ndarray) -> None:
+    room = surveyed(furnished_room())
+    failed, good = fused(Belief(truth(), covariance), room), fused(Belief(truth(), uncertain()), room)
+    first = fused(Belief(truth(), uncertain()), LocalMap(MapParams()))
     assert failed.lost and np.array_equal(failed.belief.state.T_odom_imu, truth().T_odom_imu)
     assert failed.registration.inliers == 0 and failed.registration.reason == "the update gave no finite pose"
     assert not good.lost and good.registration.inliers > iekf.MIN_INLIERS

@@ -112,6 +112,15 @@ def test_a_full_map_keeps_what_is_near() -> None:
         assert np.quantile(distance, 0.9) < 0.7, x
 
 
+def test_a_scan_that_fills_the_map_hits_each_point_once() -> None:
+    params = MapParams(max_voxels=1000, radius=100.0)
+    points = np.random.default_rng(0).uniform(-12, 12, (6000, 3))
+    full, roomy = (filled(points, params.model_copy(update={"max_voxels": most})) for most in (1000, 100_000))
+    assert 900 < full.voxels <= 1000 < roomy.voxels
+    hits = [local_map.checkpoint().points[:, 3] for local_map in (full, roomy)]
+    assert hits[0].max() <= hits[1].max() and hits[0].mean() < 1.1
+
+
 def test_lookups_end_even_if_the_map_is_full_to_the_last_voxel() -> None:
     params = MapParams(voxel_size=0.1, max_voxels=1000, radius=500.0)
     cells = np.stack(np.meshgrid(*[np.arange(10)] * 3), axis=-1).reshape(-1, 3) * 0.1 + 0.05

@@ -6,13 +6,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from app.slam import lie, pause
+from app.slam import iekf, lie, pause
 from app.slam.engine import Engine
-from app.slam.imu import DIM, GRAV, POS, ROT, VEL, Belief
+from app.slam.imu import DIM, EXT, GRAV, POS, ROT, VEL, Belief
 from app.slam.kernels import manifold
-from app.slam.types import ImuSamples, Measurement, StepResult
+from app.slam.local_map import LocalMap
+from app.slam.params import Params
+from app.slam.sections import MapParams
+from app.slam.types import ImuSamples, Measurement, Scan, StepResult
 from tests.slam.engine_runs import REAL, assert_all_same, errors, room_walk, run
-from tests.slam.scenes import Walk, furnished_room, measurements, params_for, seconds_of
+from tests.slam.scenes import Walk, furnished_room, imu_samples, measurements, params_for, seconds_of
+from tests.slam.updates import points_of, truth, uncertain
 
 BEGIN, END = 40, 62
 """Frames of the pause, which lasts 2.2 s."""
@@ -65,6 +69,23 @@ def test_after_the_pause_the_motion_is_known_as_well_as_before(begin: int, end: 
     assert results[first].keyframe.resumed_ns == long_walk()[end].scan.stamp_ns  # type: ignore[union-attr]
     assert not any(r.keyframe for r in results[begin:first])
     assert (results[first].stamp_ns - results[begin].stamp_ns) * 1e-9 == pytest.approx(pause.SETTLED_S, abs=0.2)
+
+
+def test_at_rest_after_a_pause_scans_tell_nothing_of_the_mounting() -> None:
+    points, prior = points_of(furnished_room()), Belief(truth(), uncertain())
+    scan = Scan(truth().stamp_ns + 3 * 10**9, points, *(np.zeros(len(points), k) for k in (np.int32, "f4", "u2")))
+    samples = imu_samples(Walk(still=100), REAL, np.arange(0, 21) / 200)
+    samples = replace(samples, stamps_ns=scan.stamp_ns - 50_000_000 + np.arange(21) * 5_000_000)
+    interruption = pause.before(scan, samples, truth().stamp_ns)
+    assert interruption is not None
+    belief, _ = pause.resumed(prior, interruption, scan, samples, Params())
+    local_map, T = LocalMap(MapParams()), belief.state.T_odom_lidar
+    local_map.insert(lie.moved(T, points).astype(np.float32), T[:3, 3], MapParams())
+    known = np.diag(belief.covariance)[EXT]
+    for _ in range(3):
+        belief, registration = iekf.update(belief, points, local_map, Params().filter)
+    assert registration.inliers > 300
+    np.testing.assert_allclose(np.diag(belief.covariance)[EXT], known, rtol=0.02)
 
 
 def test_without_an_imu_the_walk_goes_on_too() -> None:

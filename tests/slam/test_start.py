@@ -1,5 +1,7 @@
 """The start: what a rest tells about biases and gravity, and what is said when there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -83,6 +85,17 @@ def test_samples_that_two_scans_share_count_once() -> None:
     outcomes = run(RESTING, Params(), 30)
     stamps = outcomes[-1].still.stamps_ns
     assert np.all(np.diff(stamps) == 5_000_000)
+
+
+def test_where_the_device_lay_before_the_first_scan_does_not_count() -> None:
+    """Three seconds on its side, then picked up; only then does the LiDAR send."""
+    cover = samples(RESTING, 0.0, 3.6)
+    on_its_side = cover.accel.copy()
+    on_its_side[:600] = on_its_side[:600, [2, 1, 0]]
+    cover = replace(cover, accel=on_its_side)
+    outcome = start.proceed(None, scan_at(3.5, 3.6), cover, Params())
+    down = outcome.belief.state.R_odom_imu.T @ [0, 0, -1]
+    assert outcome.waiting and np.degrees(np.arccos(down @ RESTING.pose(3.5)[:3, :3].T @ [0, 0, -1])) < 1.0
 
 
 def test_a_moving_start_says_so_and_claims_little() -> None:

@@ -37,8 +37,8 @@ MOST_HITS = 8
 
 
 @njit(cache=True, nogil=True)
-def insert(points, eye, voxel, spacing, now, old, table, cells, counts, store, used):
-    """Add points that are not within `spacing` of a point in their own voxel. Returns (used, refused).
+def insert(points, eye, voxel, spacing, now, old, table, cells, counts, store, used, refused):
+    """Add points that are not within `spacing` of a point in their own voxel. Returns used.
 
     A point within `spacing` is another hit of the nearest there, which becomes the mean of its first MOST_HITS. So
     noise averages out. If the nearest was last seen before `old`, the point takes its place: a mean of both would
@@ -47,13 +47,13 @@ def insert(points, eye, voxel, spacing, now, old, table, cells, counts, store, u
     points (n, 3) f32 m, odom; eye (3,) m, the sensor; voxel, spacing m; now, old: drift, m². In and out: table (2^k,)
     i32, slot by hash or -1; cells (v, 3) i32, voxel indices; counts (v,) u8; store (v, m, 8) f32: x, y, z in m, hits,
     drift when last seen, and the unit vector towards the sensor at the first hit. The first `used` slots are taken. A
-    full voxel takes no more points, a full store no new voxel; `refused` counts the points that needed one.
+    full voxel takes no more points, a full store no new voxel. Out: refused (n,) bool, the points that needed one.
     """
     mask = len(table) - 1
     inverse, near2 = 1.0 / voxel, spacing * spacing
     capacity, room = store.shape[0], store.shape[1]
-    refused = 0
     for j in range(len(points)):
+        refused[j] = False
         x, y, z = points[j, 0], points[j, 1], points[j, 2]
         a, b, c = math.floor(x * inverse), math.floor(y * inverse), math.floor(z * inverse)
         h = ((a * PRIME_X) ^ (b * PRIME_Y) ^ (c * PRIME_Z)) & mask
@@ -61,7 +61,7 @@ def insert(points, eye, voxel, spacing, now, old, table, cells, counts, store, u
             k = table[h]
             if k < 0:
                 if used >= capacity:
-                    refused += 1
+                    refused[j] = True
                     break
                 k = used
                 used += 1
@@ -92,7 +92,7 @@ def insert(points, eye, voxel, spacing, now, old, table, cells, counts, store, u
                     _begin(store[k, place], x, y, z, now, eye)
                 break
             h = (h + 1) & mask
-    return used, refused
+    return used
 
 
 @njit(cache=True, nogil=True)
