@@ -18,7 +18,7 @@ import numpy as np
 from app.sensors import ros
 from app.sensors.findings import Finding
 from app.sensors.imu_units import STANDARD_GRAVITY
-from app.sensors.live.devices import mount_finding
+from app.sensors.live.devices import mount_finding, sender_of, senders_finding
 from app.sensors.live.pcap import Capture, CapturePlace
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -212,6 +212,8 @@ class OusterStream:
     def __init__(self, path: Path, metadata: Metadata) -> None:
         """Raises CaptureError: the file is no capture."""
         self._capture, self._metadata = Capture(path), metadata
+        self._sender = sender_of(self._capture.datagrams(), self._is_measured)
+        self._other_senders: set[bytes] = set()
         self._complete_at: list[tuple[int, CapturePlace]] = []
         logged, samples, missing = array("q"), 0, 0
         for log_ns, place, content in self._read(None):
@@ -232,6 +234,7 @@ class OusterStream:
         found = [
             Finding("packets", "corrected" if missing or not self.complete else "fine", text),
             Finding("sensor", "fine", rows),
+            *senders_finding(path, self._sender, self._other_senders),
         ]
         R = metadata.T_imu_lidar[:3, :3]
         if np.isfinite(metadata.T_imu_lidar).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3):
@@ -267,14 +270,20 @@ class OusterStream:
         turns = Turns(meta.width // meta.columns)
         for datagram in self._capture.datagrams(place):
             running_ns, at, payload = max(running_ns, datagram.time_ns), datagram.place, datagram.payload
-            if len(payload) == _IMU.itemsize:
+            if datagram.sender != self._sender:
+                if self._is_measured(payload):
+                    self._other_senders.add(datagram.sender)
+            elif len(payload) == _IMU.itemsize:
                 yield running_ns, at, payload
-            elif len(payload) == meta.packet_bytes:
+            elif self._is_measured(payload):
                 column = int.from_bytes(payload[(first := meta.profile.header + 8) : first + 2], "little")
                 for packets in turns.add(self._frame_of(payload), column, payload):
                     yield running_ns, at, packets
         for packets in turns.rest():
             yield running_ns, at, packets
+
+    def _is_measured(self, packet: bytes) -> bool:
+        return len(packet) == self._metadata.packet_bytes
 
     def _frame_of(self, packet: bytes) -> int:
         at = 2 if self._metadata.profile.header else 10

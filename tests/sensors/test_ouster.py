@@ -231,6 +231,29 @@ def test_the_imu_is_where_the_metadata_puts_it_and_missed_if_it_is_silent(tmp_pa
     assert findings["IMU"].verdict == "needs you"
 
 
+def test_of_two_ousters_only_one_is_read_with_its_imu_and_the_other_is_reported(tmp_path: Path) -> None:
+    path = made("LEGACY", tmp_path)
+    mine = [(one.time_ns, 7502, one.payload) for one in Capture(path).datagrams()]
+    mine = sorted([*mine, *((time_ns + 1_000, 7503, bytes(48)) for time_ns, _, _ in mine)])
+    path.write_bytes(captures.pcap(mine))
+    metadata = metadata_beside(path)
+    assert metadata is not None
+    alone = OusterStream(path, metadata)
+    topics = (LIDAR_TOPIC, IMU_TOPIC)
+    expected = list(alone.messages(topics, 0, 2**62))
+    path.write_bytes(captures.pcap(mine, others=[(at + 100, port, packet) for at, port, packet in mine[:-1]]))
+    stream = OusterStream(path, metadata)
+    assert stream.counts == alone.counts
+    found = list(stream.messages(topics, 0, 2**62))
+    assert [entry[:2] for entry in found] == [entry[:2] for entry in expected]
+    for one, other in zip(found, expected, strict=True):
+        if one[0] == LIDAR_TOPIC:
+            np.testing.assert_array_equal(one[2].data, other[2].data)
+    assert {f.subject for f in stream.findings} - {f.subject for f in alone.findings} == {"LiDARs"}
+    finding = next(f for f in stream.findings if f.subject == "LiDARs")
+    assert finding.verdict == "needs you" and "only 192.168.1.200 is read" in finding.text
+
+
 def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path) -> None:
     for columns in (0, -16):
         path = made("LEGACY", tmp_path, columns_per_packet=columns, lidar_data_format={}, columns_per_frame=32)

@@ -1,7 +1,7 @@
 """A network capture as a recording: a sensor's packets and `imu-udp` datagrams of a .pcap or .pcapng.
 
 Opening reads the file once and notes where each revolution was complete, so that reading can begin near any time. The
-packets are recognised by their content, whatever their ports.
+packets are recognised by their content, whatever their ports. Those of a second LiDAR are left out.
 """
 
 import bisect
@@ -17,7 +17,7 @@ from app.sensors import ros
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
 from app.sensors.live.clock import JUMP_NS, ClockMap
-from app.sensors.live.devices import DEVICES, device_of, mount_finding
+from app.sensors.live.devices import DEVICES, device_of, mount_finding, sender_of, senders_finding
 from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
 from app.sensors.live.frames import Assembler, Revolution, sensor_of
 from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample, is_imu, read_imu
@@ -50,9 +50,11 @@ class CaptureStream:
         """Raises CaptureError: the file is no capture. HemislamError: the angles beside it cannot be read."""
         from app.sensors.live.decoder import Decoder
 
-        self._capture = Capture(path)
+        self._path, self._capture = path, Capture(path)
         sidecar = path.with_name(f"{path.stem}.angles.csv")
-        found = device_of(datagram.payload for datagram in self._capture.datagrams())
+        self._sender = sender_of(self._capture.datagrams(), lambda payload: sensor_of(payload) is not None)
+        self._other_senders: set[bytes] = set()
+        found = device_of(one.payload for one in self._capture.datagrams() if one.sender == self._sender)
         self._device = found or DEVICES["rsbpearl"]
         self._lidar_topic, self._imu_topic = self._device.layout.lidar_topic, self._device.layout.imu_topic
         model, own = self._device.model, sidecar.is_file() and self._device.has_angles
@@ -112,8 +114,12 @@ class CaptureStream:
         for datagram in self._capture.datagrams(place):
             at, running_ns, payload = datagram.place, max(running_ns, datagram.time_ns), datagram.payload
             found: list[Any] = []
-            if is_imu(payload):
-                beside = payload.startswith(IMU_MAGIC)
+            beside = payload.startswith(IMU_MAGIC)
+            if not beside and datagram.sender != self._sender is not None:
+                counters.foreign += 1
+                if sensor_of(payload) is not None:
+                    self._other_senders.add(datagram.sender)
+            elif is_imu(payload):
                 if beside and not self._beside and read_imu(payload):
                     self._beside, order = True, ImuOrder(counters)
                     counters.imu_foreign += counters.imu
@@ -189,6 +195,7 @@ class CaptureStream:
         wrong = counters.lost or counters.truncated or counters.late or counters.imu_lost or not self.complete
         text = counters.describe() + ("" if self.complete else "; the file is cut off there")
         found = [Finding("packets", "corrected" if wrong else "fine", text)]
+        found += senders_finding(self._path, self._sender, self._other_senders)
         if self._lidar_topic in self.counts:
             found += self._device_findings()
         if self._beside and self._own:

@@ -45,11 +45,12 @@ class CapturePlace:
 
 @dataclass(frozen=True, slots=True)
 class Datagram:
-    """One UDP datagram. place: of the captured frame that completes it."""
+    """One UDP datagram. place: of the captured frame that completes it. sender: IP address, as in the packet."""
 
     place: CapturePlace
     time_ns: int
     payload: bytes
+    sender: bytes
 
 
 Captured = tuple[CapturePlace, int, int, bytes]
@@ -89,7 +90,8 @@ class Capture:
                 if packet and 0 <= time_ns < _FAR_NS:
                     payload = _udp_payload(packet, waiting)
                     if payload is not None:
-                        yield Datagram(at, time_ns, payload)
+                        sender = packet[12:16] if packet[0] >> 4 == 4 else packet[8:24]
+                        yield Datagram(at, time_ns, payload, sender)
 
     def _classic_frames(self, file: BinaryIO, place: CapturePlace) -> Iterator[Captured]:
         header = struct.Struct(place.order + "4I")

@@ -143,6 +143,49 @@ def test_of_two_imus_only_the_one_beside_the_sensor_is_read(tmp_path: Path) -> N
     assert "IMU" not in {f.subject for f in CaptureStream(tmp_path / "one.pcap").findings}
 
 
+@pytest.mark.parametrize("shape", ["plain", "fragments", "ipv6"])
+def test_of_two_lidars_only_one_is_read_with_its_own_imu_and_the_other_is_reported(tmp_path: Path, shape: str) -> None:
+    """The other sees 10 m where this one sees 5 m and has other angles; it is the first to send, but sends less."""
+    sample = ImuSample(0, sensor.START_NS, (9.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+    block = 12 * 55_520
+    others: list[captures.Entry] = [(0, 7788, sensor.difop(angles=[(e - 0.5, 0.0) for e in sensor.ELEVATIONS]))]
+    others += [(1, 6699, sensor.turns(TURNS, distance=2000)[0])]
+    others += [
+        (sensor.START_NS + (k + 1) * block + 40_000, 6699, packet)
+        for k, packet in enumerate(sensor.turns(TURNS, distance=2000, start_ns=sensor.START_NS + 40_000))
+        if k % 10
+    ]
+    others += [
+        (time - 400_000, 6688, write_airy_imu(replace(sample, number=k, stamp_ns=time - 400_000)))
+        for k, (time, port, _) in enumerate(walk())
+        if port == 6700
+    ]
+    found = {}
+    for name, second in (("one", []), ("two", others)):
+        (tmp_path / f"{name}.pcap").write_bytes(captures.pcap(walk(), shape, others=second))
+        found[name] = measurements(tmp_path / f"{name}.pcap")
+    assert len(found["one"]) == len(found["two"]) == TURNS
+    for one, two in zip(found["one"], found["two"], strict=True):
+        np.testing.assert_array_equal(one.scan.points, two.scan.points)
+        np.testing.assert_array_equal(one.imu.stamps_ns, two.imu.stamps_ns)
+        np.testing.assert_array_equal(one.imu.gyro, two.imu.gyro)
+    findings = {f.subject: f for f in examine(tmp_path / "two.pcap", Params())}
+    used, other = ("::c8", "::c9") if shape == "ipv6" else ("192.168.1.200", "192.168.1.201")
+    assert findings["LiDARs"].verdict == "needs you"
+    for words in (f"only {used} is read", f"{other} left out", f"not src host {used}"):
+        assert words in findings["LiDARs"].text
+    assert f"{len(others) + 1} foreign" in findings["packets"].text  # and one of `walk`
+    assert "LiDARs" not in {f.subject for f in examine(tmp_path / "one.pcap", Params())}
+
+
+def test_an_imu_beside_the_lidar_may_send_from_another_address(tmp_path: Path) -> None:
+    path = tmp_path / "walk.pcap"
+    lidar = [entry for entry in walk() if entry[1] != 6700]
+    path.write_bytes(captures.pcap(lidar, others=[entry for entry in walk() if entry[1] == 6700]))
+    assert len(measurements(path)) == TURNS
+    assert "LiDARs" not in {f.subject for f in CaptureStream(path).findings}
+
+
 def test_a_clock_set_on_the_way_does_not_end_the_recording(tmp_path: Path) -> None:
     half = TURNS // 2 * TURN_NS
     entries = walk()
