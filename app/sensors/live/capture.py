@@ -22,9 +22,11 @@ from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
 from app.sensors.live.frames import Assembler, Revolution, sensor_of
 from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample, is_imu, read_imu
 from app.sensors.live.livox_udp import read_points
+from app.sensors.live.msop import other_sensor
 from app.sensors.live.pcap import Capture, CapturePlace
 from app.sensors.live.status import Counters
 from app.sensors.robosense import Model
+from app.slam.errors import HemislamError
 from app.slam.types import I64, Scan
 
 SUFFIXES = (".pcap", ".pcapng")
@@ -47,7 +49,7 @@ class CaptureStream:
     by_log_time = True
 
     def __init__(self, path: Path) -> None:
-        """Raises CaptureError: the file is no capture. HemislamError: the angles beside it cannot be read."""
+        """Raises CaptureError: it is no capture. HemislamError: its sensor, or the angles beside it, cannot be read."""
         from app.sensors.live.decoder import Decoder
 
         self._path, self._capture = path, Capture(path)
@@ -55,6 +57,11 @@ class CaptureStream:
         self._sender = sender_of(self._capture.datagrams(), lambda payload: sensor_of(payload) is not None)
         self._other_senders: set[bytes] = set()
         found = device_of(one.payload for one in self._capture.datagrams() if one.sender == self._sender)
+        others = (other for one in self._capture.datagrams() if (other := other_sensor(one.payload)))
+        if found is None and (other := next(others, "")):
+            raise HemislamError(
+                f"{path} holds packets of {other}, which are not read; record the topics of its ROS driver instead."
+            )
         self._device = found or DEVICES["rsbpearl"]
         self._lidar_topic, self._imu_topic = self._device.layout.lidar_topic, self._device.layout.imu_topic
         model, own = self._device.model, sidecar.is_file() and self._device.has_angles

@@ -97,7 +97,7 @@ class Assembler:
         """Revolutions that this packet completes, mostly none. arrival_ns: by the host's clock."""
         head = _read(packet)
         if head is None:
-            if msop.is_marked(packet):
+            if msop.is_cut(packet):
                 self.counters.truncated += 1
             else:
                 self.counters.foreign += 1

@@ -26,16 +26,42 @@ _AZIMUTHS = {
     for model in (BPEARL, BPV4, AIRY)
 }
 _TYPE_BPV4 = b"\x03\x04"
+_TYPE_AIRY = 0x31
+_TYPE_BPEARL = 3
+_LIKE_BPEARL = {1: "an RS-LiDAR-16", 2: "an RS-LiDAR-32"}
+"""Sensors whose packets have the RS-Bpearl's mark and blocks, by type."""
+_LIKE_AIRY = {1: 48, 3: 192}
+"""Channels of the Airys that do not have 96, by model."""
 
 
-def is_marked(packet: bytes) -> bool:
-    """Whether it begins like a measurement packet."""
-    return packet.startswith((BPEARL.mark, AIRY.mark))
+def is_cut(packet: bytes) -> bool:
+    """Whether it begins like a measurement packet, but has another length."""
+    return packet.startswith((BPEARL.mark, AIRY.mark)) and len(packet) != PACKET_BYTES
+
+
+def other_sensor(packet: bytes) -> str:
+    """Which RoboSense that cannot be read sent this measurement packet; "" if it can be read, or is none.
+
+    The type is in byte 31, of the first generation in byte 30. One that is not known, or zero, excludes nothing if the
+    blocks are where they should be.
+    """
+    if len(packet) != PACKET_BYTES:
+        return ""
+    if packet.startswith(BPEARL.mark):
+        stated = packet[30:32]
+        return "" if _TYPE_BPEARL in stated else next((_LIKE_BPEARL[one] for one in stated if one in _LIKE_BPEARL), "")
+    if not packet.startswith(AIRY.mark):
+        return ""
+    if packet[31] == _TYPE_AIRY:
+        return f"an Airy of {_LIKE_AIRY[packet[32]]} channels" if packet[32] in _LIKE_AIRY else ""
+    begins = range(HEADER_BYTES, HEADER_BYTES + AIRY.blocks * AIRY.parts * AIRY.part_bytes, AIRY.part_bytes)
+    fits = all(packet[at : at + 2] == b"\xff\xee" for at in begins)
+    return "" if fits else f"another RoboSense, of type {packet[31]:#04x}"
 
 
 def model_of(packet: bytes) -> Model | None:
-    """The sensor that sent it; None if it is no whole measurement packet."""
-    if len(packet) != PACKET_BYTES or not is_marked(packet):
+    """The sensor that sent it; None if it is no whole measurement packet, or of a sensor that cannot be read."""
+    if len(packet) != PACKET_BYTES or not packet.startswith((BPEARL.mark, AIRY.mark)) or other_sensor(packet):
         return None
     if packet.startswith(AIRY.mark):
         return AIRY
@@ -113,7 +139,7 @@ def _stamp_bytes(stamp_ns: int, model: Model) -> bytes:
     """Bytes 20 to 33: time, and which sensor it is."""
     if model is BPEARL:
         return date_bytes(stamp_ns) + b"\x00\x03\x01"
-    return utc_bytes(stamp_ns) + b"\x00" + (_TYPE_BPV4 if model is BPV4 else b"\x31\x02")
+    return utc_bytes(stamp_ns) + b"\x00" + (_TYPE_BPV4 if model is BPV4 else bytes([_TYPE_AIRY, 2]))
 
 
 def _date_ns(date: bytes) -> int | None:

@@ -18,6 +18,7 @@ from app.sensors.live.frames import Assembler, Revolution, sensor_of
 from app.sensors.live.imu_udp import ImuOrder, ImuSample, is_imu
 from app.sensors.live.intake import Intake
 from app.sensors.live.livox_udp import read_points
+from app.sensors.live.msop import other_sensor
 from app.sensors.robosense import Model
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -127,7 +128,7 @@ class PacketReceiver:
         self._angles_settled = angles is not None or not device.has_angles
         self._sensor: Peer | None = None
         self._heard_s = 0.0
-        self._reported_another = False
+        self._reported_another = self._reported_unreadable = False
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         self._assembler.counters = self._order.counters = intake.counters
@@ -165,6 +166,10 @@ class PacketReceiver:
                 self._configure(difop, now, intake)
         elif sensor is None or sensor in self._models:
             self._frames += self._assembler.add(packet, now)
+            if sensor is None and not self._reported_unreadable and (other := other_sensor(packet)):
+                self._reported_unreadable = True
+                text = f"{peer[0]} is {other}, whose packets are not read; take its clouds from ROS, by foxglove://"
+                intake.put_status("configuration", "LiDAR", text)
         else:
             intake.counters.foreign += 1
 

@@ -3,6 +3,7 @@
 import functools
 import random
 import struct
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import pytest
 
 from app.sensors.doctor import examine
 from app.sensors.live.capture import CaptureStream
+from app.sensors.live.frames import sensor_of
 from app.sensors.live.imu_udp import ImuSample, write_airy_imu
 from app.sensors.recording import open_recording
+from app.sensors.robosense import BPEARL, BPV4
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement
@@ -221,6 +224,44 @@ def test_other_files_are_refused_with_the_reason(tmp_path: Path) -> None:
     path.write_bytes(b"")
     with pytest.raises(HemislamError, match="is empty"):
         open_recording(path, Params())
+
+
+OTHERS = [
+    ("55aa050a5aa550a0", {30: 1, 31: 0, 32: 0}, "an RS-LiDAR-16"),
+    ("55aa050a5aa550a0", {30: 2, 31: 0, 32: 0}, "an RS-LiDAR-32"),
+    ("55aa050a5aa550a0", {30: 0, 31: 2, 32: 1}, "an RS-LiDAR-32"),
+    ("55aa055a00000000", {30: 0, 31: 5, 32: 0}, "another RoboSense, of type 0x05"),
+]
+"""Sensors with blocks like an RS-Bpearl's: mark, bytes of the header, and name."""
+
+
+def stating(mark: str, header: dict[int, int], packets: Iterable[bytes]) -> Iterator[bytes]:
+    for packet in packets:
+        changed = bytearray(bytes.fromhex(mark) + packet[8:])
+        for at, value in header.items():
+            changed[at] = value
+        yield bytes(changed)
+
+
+@pytest.mark.parametrize(("mark", "header", "name"), OTHERS)
+def test_packets_of_another_robosense_are_refused_by_its_name(
+    tmp_path: Path, mark: str, header: dict[int, int], name: str
+) -> None:
+    path = tmp_path / "walk.pcap"
+    changed = stating(mark, header, sensor.turns(2))
+    entries = [entry for entry in walk() if entry[1] == 6700]
+    entries += [(sensor.START_NS + k * 12 * 55_520, 6699, packet) for k, packet in enumerate(changed)]
+    path.write_bytes(captures.pcap(entries))
+    for opened in (open_recording, examine):
+        with pytest.raises(HemislamError, match=f"holds packets of {name}, which are not read; record"):
+            opened(path, Params())
+
+
+@pytest.mark.parametrize("types", [(0, 3, 1), (3, 0, 0), (3, 2, 0), (1, 3, 4), (0, 0, 0), (7, 9, 200)])
+def test_an_rs_bpearl_is_read_wherever_it_states_its_type_or_if_it_states_none(types: tuple[int, int, int]) -> None:
+    header = dict(zip((30, 31, 32), types, strict=True))
+    for packet in stating("55aa050a5aa550a0", header, sensor.turns(1)):
+        assert sensor_of(packet) is (BPV4 if types[1:] == (3, 4) else BPEARL)
 
 
 def test_angles_beside_the_capture_win(tmp_path: Path) -> None:

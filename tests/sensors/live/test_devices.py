@@ -190,6 +190,30 @@ def received(scheme: str, packets: list[bytes], wanted: Callable[[Intake], bool]
     return intake
 
 
+def airy_stating(kind: int, model: int) -> bytes:
+    packet = airy_msop(START_NS, [0, 40, 80, 120], 1000)
+    return packet[:31] + bytes([kind, model]) + packet[33:]
+
+
+@pytest.mark.parametrize(("model", "channels"), [(1, 48), (3, 192)])
+def test_an_airy_of_other_than_96_channels_is_left_out_and_reported_once(model: int, channels: int) -> None:
+    packets = [airy_stating(0x31, model)] * 3
+    intake = received("airy", packets, lambda intake: intake.counters.foreign == 3)
+    told = [entry.text for entry in intake.take(0.0, scan=False)[0] if isinstance(entry, Status)]
+    assert told == [
+        f"127.0.0.1 is an Airy of {channels} channels, whose packets are not read; take its clouds from ROS, by foxglove://"
+    ]
+    assert intake.counters.foreign == 3 and not intake.counters.truncated and not intake.counters.packets
+
+
+def test_an_airy_is_known_by_its_blocks_if_not_by_its_type() -> None:
+    for kind, model in ((0x31, 2), (0x31, 0), (0, 0), (0x32, 2)):
+        assert device_of([airy_stating(kind, model)]) is DEVICES["airy"]
+    damaged = bytearray(airy_stating(0x31, 2))
+    damaged[190] = 0
+    assert device_of([bytes(damaged)]) is DEVICES["airy"]
+
+
 def test_a_mid360_that_sees_nothing_is_reported() -> None:
     packets = [livox(1, 96, bytes(96 * 14), START_NS + k * 100_000_000) for k in range(103)]
     intake = received("mid360", packets, lambda intake: intake.counters.unreadable > 0)
