@@ -134,10 +134,14 @@ def expect(
     left = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]  # what the graph leaves of each loop
     missed = np.maximum(np.linalg.norm(left[:, :3, 3], axis=1) - POSITION_M, 0.0) / drift.translation
     turned = np.maximum(np.linalg.norm(lie.log(left[:, :3, :3]), axis=1) - ROTATION, 0.0) / drift.rotation
-    first = np.concatenate([np.arange(count - 1), pairs[:, 0]])
-    second = np.concatenate([np.arange(1, count), pairs[:, 1]])
-    length = np.concatenate([steps, np.maximum(missed, turned)])
-    length = length + 1e-6  # scipy drops edges of length 0
+    short = np.maximum(missed, turned)
+    neighbours = pairs[:, 1] - pairs[:, 0] == 1  # such a loop stands in for the step, since two edges would add up
+    unpaused = np.zeros(count, np.bool_)
+    unpaused[pairs[neighbours, 1]] = short[neighbours] < steps[pairs[neighbours, 0]]
+    np.minimum.at(steps, pairs[neighbours, 0], short[neighbours])
+    first = np.concatenate([np.arange(count - 1), pairs[~neighbours, 0]])
+    second = np.concatenate([np.arange(1, count), pairs[~neighbours, 1]])
+    length = np.concatenate([steps, short[~neighbours]]) + 1e-6  # scipy drops edges of length 0
     graph = coo_array((length, (first, second)), shape=(count, count))  # type: ignore[no-untyped-call]  # no types
     way, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
 
@@ -146,7 +150,7 @@ def expect(
     tied = before.copy()
     stretch = way - way[before]
     each = np.arange(count)
-    across = (np.abs(each - before) == 1) & resumed[np.maximum(each, before)]
+    across = (np.abs(each - before) == 1) & (resumed & ~unpaused)[np.maximum(each, before)]
     moment = np.column_stack(
         [stretch[:, None] * (p + p[before]) / 2, across, across[:, None] * p[np.maximum(each, before)]]
     )

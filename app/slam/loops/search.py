@@ -201,7 +201,7 @@ class Search:
         """Candidates with a verdict on each alone."""
         out: list[LoopEdge] = []
         for sighting in self.detector.look(newer, expectation, params):
-            between = [index for index in self._loose if sighting.older < index <= newer]
+            between = [index for index in self._loose if sighting.older < index <= min(newer, len(self) - slips.REACH)]
             broken = any(slip.is_break for index in between if (slip := self.detector.slip(index)))
             out.append(judge(sighting, self.detector, expectation, params, broken=broken))
             if out[-1].verdict is Verdict.CANDIDATE and out[-1].evidence.gate_m < SURE_M:

@@ -77,6 +77,16 @@ def test_a_loop_is_a_short_cut_and_one_that_is_not_met_a_longer_one() -> None:
     assert missed.way[0] == pytest.approx(2.0 + (0.15 - POSITION_M) / DRIFT.translation, abs=0.01)
 
 
+def test_a_loop_across_a_pause_stands_in_for_the_step_between_its_ends() -> None:
+    """As a loop made by hand does; what is known before the pause is then as sure as what came after it."""
+    poses, resumed = path(square()), np.arange(81) == 60
+    apart = expect(80, poses, [], DRIFT, resumed)
+    tied = expect(80, poses, [loop(59, 60, poses)], DRIFT, resumed)
+    without = expect(80, poses, [], DRIFT)
+    assert apart.way[0] > PAUSE_M and apart.pauses[0] == 1
+    assert tied.way[0] == pytest.approx(without.way[0] - 0.5, abs=1e-3) and tied.pauses[0] == 0
+
+
 def test_what_odometry_expects_is_no_deviation_and_a_sigma_off_is_one() -> None:
     poses = path(square())
     expectation = expect(80, poses, [], DRIFT)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from app.slam import lie
-from app.slam.loops.detection import Detector
+from app.slam.loops.detection import Detector, Sighting
 from app.slam.loops.search import Search
-from app.slam.loops.slips import BREAK_M, REACH, slip
+from app.slam.loops.slips import BREAK_M, REACH, Slip, slip
+from app.slam.loops.types import Evidence, LoopEdge, Verdict
 from app.slam.sections import LoopsParams
 from app.slam.types import F64, Cloud, Keyframe
 from tests.slam.loops.test_verification import FINS, corridor, pose, seen
@@ -112,6 +113,30 @@ def test_the_graph_may_bend_where_odometry_slipped_once_that_is_seen(straight: W
     assert sigma_m(AT) > 0.3 and sigma_m(AT - REACH) < 0.03
     search.go_to(AT + REACH - 1)
     assert sigma_m(AT) < 0.03, "it was not seen yet"
+    search.close()
+
+
+def test_an_end_before_a_break_is_seen_knows_nothing_of_it(straight: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the walk ends there or was taken back to there."""
+    told: list[tuple[int, bool]] = []
+
+    def judged(sighting: Sighting, *_: object, broken: bool) -> LoopEdge:
+        told.append((sighting.newer, broken))
+        return LoopEdge(
+            sighting.older, sighting.newer, sighting.newer, np.eye(4), np.eye(6), Evidence(), Verdict.REJECTED, ""
+        )
+
+    monkeypatch.setattr("app.slam.loops.search.judge", judged)
+    monkeypatch.setattr(Detector, "look", lambda self, newer, *_: [Sighting(0, newer, 0.1)] if newer >= AT else [])
+    monkeypatch.setattr(Detector, "slip", lambda self, index: Slip(np.full(6, 0.5), True) if index == AT else None)
+    search, end = Search(), AT + REACH - 1
+    for keyframe in straight.keyframes:
+        search.add(keyframe, LoopsParams(submap_keyframes=2))
+    assert (end, True) in told, "once it is seen it counts"
+    search.go_to(end)
+    told.clear()
+    search.finish()
+    assert told and not any(broken for _, broken in told)
     search.close()
 
 
