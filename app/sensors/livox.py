@@ -104,6 +104,21 @@ class CustomMsg:
         """(bytes,) of the points."""
         return self.points.view(np.uint8)
 
+    def cdr(self) -> bytes:
+        """As livox_ros_driver2 sends it in ROS 2."""
+        stamp = self.header.stamp
+        head = struct.pack("<4B3I", 0, 1, 0, 0, stamp.sec, stamp.nanosec, len(_FRAME)) + _FRAME
+        head += bytes(-(len(head) - 4) % 8)
+        count, begin_ns = len(self.points), stamp.sec * 1_000_000_000 + stamp.nanosec
+        rows = np.zeros(count, _dtype("<", 20))
+        rows[:] = self.points
+        return head + struct.pack("<QIB3xI", begin_ns, self.stated, 0, count) + rows.tobytes()[:-1]
+
+
+def definition(kind: str) -> str:
+    """The text of a driver's message, in ROS 2."""
+    return DEFINITION.replace(DRIVERS[0], kind.partition("/")[0])
+
 
 def encoded(scan: Scan) -> bytes:
     """The scan as livox_ros_driver2 sends it: CDR, stamped at the first point, lines 0 to 3 in turn."""
@@ -111,11 +126,7 @@ def encoded(scan: Scan) -> bytes:
     points["x"], points["y"], points["z"] = scan.points.T
     points["offset_time"], points["reflectivity"] = scan.offsets_ns, scan.intensity
     points["tag"], points["line"] = _SURE, np.arange(len(scan)) % 4
-    seconds, nanoseconds = divmod(scan.stamp_ns, 1_000_000_000)
-    head = struct.pack("<4x3I", seconds, nanoseconds, len(_FRAME)) + _FRAME
-    head = b"\0\1\0\0" + head[4:] + bytes(-(len(head) - 4) % 8)
-    body = points.tobytes()
-    return head + struct.pack("<QIB3xI", scan.stamp_ns, len(scan), 0, len(scan)) + body[: len(body) - 1]
+    return CustomMsg._of(*divmod(scan.stamp_ns, 1_000_000_000), len(scan), points).cdr()
 
 
 def _dtype(order: str, step: int) -> np.dtype[Any]:

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from app.sensors.livox import CUSTOM_MSGS, DEFINITION, CustomMsg, encoded
+from app.sensors import livox
+from app.sensors.livox import CUSTOM_MSGS, CustomMsg
 from app.slam.types import Scan, Vector
 
 LIDAR_TOPIC, IMU_TOPIC = "/rslidar_points", "/imu/data"
@@ -154,11 +155,15 @@ def header(stamp_ns: int, frame: str) -> Any:
 
 def serialised(message: Any) -> bytes:
     """As CDR, which ROS 2 sends and records."""
+    if isinstance(message, CustomMsg):
+        return message.cdr()
     return bytes(_ROS2.serialize_cdr(message, message.__msgtype__))
 
 
 def definition(kind: str) -> str:
     """The type's text, with the types that it contains."""
+    if kind in CUSTOM_MSGS:
+        return livox.definition(kind)
     return str(_ROS2.generate_msgdef(kind)[0])
 
 
@@ -167,18 +172,17 @@ class Layout:
     """How a driver records its scanner.
 
     Attributes:
-        kind: type of the clouds. text: its definition; "": that of ROS. encode: a cloud as CDR.
+        kind: type of the clouds. encode: a cloud as CDR.
     """
 
     lidar_topic: str = LIDAR_TOPIC
     imu_topic: str = IMU_TOPIC
     kind: str = CLOUD
-    text: str = ""
     encode: Callable[[Scan], bytes] = lambda scan: serialised(cloud_message(scan))
 
 
 AIRY_LAYOUT = Layout(imu_topic="/rslidar_imu_data")
-MID360_LAYOUT = Layout("/livox/lidar", "/livox/imu", CUSTOM_MSGS[0], DEFINITION, encoded)
+MID360_LAYOUT = Layout("/livox/lidar", "/livox/imu", CUSTOM_MSGS[0], livox.encoded)
 
 
 class RecordingWriter:
@@ -189,7 +193,7 @@ class RecordingWriter:
         self._encode = layout.encode
         self._mcap = Writer(file, compression=CompressionType.ZSTD)
         self._mcap.start(profile="ros2")
-        self._lidar = self._channel(layout.lidar_topic, layout.kind, layout.text)
+        self._lidar = self._channel(layout.lidar_topic, layout.kind)
         self._imu = self._channel(layout.imu_topic, IMU)
         self._others: dict[str, int] = {}
 
@@ -213,8 +217,8 @@ class RecordingWriter:
         """Write the index and the end of the file."""
         self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
 
-    def _channel(self, topic: str, kind: str, text: str = "") -> int:
-        schema = self._mcap.register_schema(kind, "ros2msg", (text or definition(kind)).encode())
+    def _channel(self, topic: str, kind: str) -> int:
+        schema = self._mcap.register_schema(kind, "ros2msg", definition(kind).encode())
         return self._mcap.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
 
     def _add(self, channel: int, data: bytes, log_ns: int) -> None:

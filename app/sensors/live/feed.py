@@ -168,7 +168,7 @@ def feed(
             return _feed_packets(recording, to, imu_to, pace, duration_s, pose)
     if to.scheme == "foxglove":
         with open_recording(path, params) as recording:
-            topics = (recording.lidar_topic, recording.imu_topic)
+            topics = tuple(filter(None, (recording.lidar_topic, recording.imu_topic)))
         return _feed_foxglove(path, topics, to, pace, duration_s)
     raise HemislamError(f"Play it out to {'://, '.join(DEVICES)}:// or foxglove://.")
 
@@ -193,7 +193,7 @@ def _feed_packets(
     return number
 
 
-def _feed_foxglove(path: Path, topics: tuple[str, str], to: Address, pace: Pace, duration_s: float | None) -> int:
+def _feed_foxglove(path: Path, topics: tuple[str, ...], to: Address, pace: Pace, duration_s: float | None) -> int:
     host, number = to.host or "127.0.0.1", 0
     with Source(path) as source:
         kinds = {topic.name: topic.type for topic in source.topics}

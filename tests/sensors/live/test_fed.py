@@ -5,7 +5,9 @@ Tests app/sensors/live/feed.py, app/sensors/live/urls.py.
 
 import contextlib
 import math
+import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,11 +18,13 @@ from app.sensors.live.feed import Pace, feed, packets_of
 from app.sensors.live.livox_udp import LivoxWriter
 from app.sensors.live.source import Event
 from app.sensors.live.urls import open_live, parse_address
+from app.sensors.livox import DRIVERS
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement, Scan
+from tests.sensors import rig, test_livox
 from tests.sensors.live import ports
 
 SAMPLE = Path(__file__).resolve().parents[3] / "sample_data" / "cloister.mcap"
@@ -39,11 +43,13 @@ def filed(params: Params) -> list[Measurement]:
 
 
 @contextlib.contextmanager
-def feeding(params: Params, to: str, imu_to: str | None = None, speed: float = 1.0) -> Iterator[None]:
+def feeding(
+    params: Params, to: str, imu_to: str | None = None, speed: float = 1.0, path: Path = SAMPLE
+) -> Iterator[None]:
     stop = threading.Event()
     thread = threading.Thread(
         target=feed,
-        args=(SAMPLE, params, parse_address(to), parse_address(imu_to) if imu_to else None),
+        args=(path, params, parse_address(to), parse_address(imu_to) if imu_to else None),
         kwargs={"pace": Pace(speed, stop), "duration_s": SECONDS},
     )
     thread.start()
@@ -110,6 +116,38 @@ def test_through_foxglove_the_same_to_the_bit(params: Params, filed: list[Measur
             np.testing.assert_array_equal(getattr(live.scan, name), getattr(file.scan, name))
         for name in ("stamps_ns", "gyro", "accel"):
             np.testing.assert_array_equal(getattr(live.imu, name), getattr(file.imu, name))
+
+
+@pytest.mark.parametrize(("driver", "ros"), [(DRIVERS[0], 2), (DRIVERS[1], 1)])
+def test_livoxs_own_message_goes_through_foxglove_as_it_is(tmp_path: Path, driver: str, ros: int) -> None:
+    path = rig.write(tmp_path / "walk", livox_walk(driver, ros), "bag" if ros == 1 else "mcap")
+    url = f"foxglove://127.0.0.1:{ports.free(1, socket.SOCK_STREAM)[0]}"
+    with feeding(Params(), url, path=path), open_live(url, Params()) as source:
+        found = ports.measurements(ports.collect(source, lambda e: len(ports.measurements(e)) >= 15))
+    for number, measurement in enumerate(found):
+        truth = rig.turn(number, 30)
+        assert measurement.scan.stamp_ns == truth.begin_ns
+        np.testing.assert_array_equal(measurement.scan.points, truth.points.astype(np.float32))
+        np.testing.assert_array_equal(measurement.scan.offsets_ns, truth.offsets_ns)
+        np.testing.assert_array_equal(measurement.scan.intensity, 10 + np.arange(len(truth)) % 200)
+
+
+def livox_walk(driver: str, ros: int) -> list[rig.Entry]:
+    def cloud(log_ns: int) -> object:
+        return test_livox.message(rig.turn((log_ns - rig.START_NS) // rig.PERIOD_NS - 1, 30), driver, ros)
+
+    entries = rig.walk(20, columns=30, ros=ros)
+    return [(topic, log_ns, cloud(log_ns) if topic == "/points" else made) for topic, log_ns, made in entries]
+
+
+def test_a_recording_without_an_imu_goes_through_foxglove_too(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", [entry for entry in rig.walk(20, columns=30) if entry[0] == "/points"])
+    url = f"foxglove://127.0.0.1:{ports.free(1, socket.SOCK_STREAM)[0]}"
+    with open_live(url, Params()) as source, feeding(Params(), url, path=path):
+        deadline = time.monotonic() + 20.0
+        while source.state().counters.frames < 20 and time.monotonic() < deadline:
+            source.poll(0.05)
+        assert source.state().counters.frames == 20
 
 
 def test_another_lidars_recording_is_no_rsbpearls(shared_data: Path) -> None:
