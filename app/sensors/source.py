@@ -1,5 +1,6 @@
 """Recording files as a stream of messages, and each of their failures as one clear sentence."""
 
+import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from app.sensors.ros import Deserialiser
 from app.sensors.unpacking import limit_rosbags
 from app.slam.errors import HemislamError, printable
 
+_COMPRESSED = (".zst", ".zstd")
 SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
 _MAGIC = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _REPAIR = {
@@ -190,6 +192,8 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
             raise HemislamError(_refusal(path, error)) from error
         return salvaged
     if path.is_dir() and files != [path]:
+        if files[0].suffix == ".bag":
+            return reader, (Finding("file", "fine", f"{len(files)} .bag file(s), read as one recording"),)
         text = f"the folder has no metadata.yaml; its {len(files)} {files[0].suffix} file(s) were read without it"
         return reader, (Finding("file", "corrected", text),)
     return reader, ()
@@ -255,6 +259,10 @@ def _recording_files(path: Path) -> list[Path]:
         if path.suffix.lower() == ".osf":
             pcap = path.with_suffix(".pcap")
             raise HemislamError(f"{path} is read by Ouster's own tool only; `ouster-cli source {path} save {pcap}`.")
+        if path.suffix.lower() in _COMPRESSED:
+            whole = (path.parent / "metadata.yaml").is_file()
+            advice = f"open its folder {path.parent}" if whole else f"`unzstd {path}` unpacks it"
+            raise HemislamError(f"{path} is compressed as a whole file; {advice}.")
         if path.suffix.lower() not in SUFFIXES:
             raise HemislamError(f"{path} does not look like a recording; hemislam reads {_KINDS}.")
         if path.stat().st_size == 0:
@@ -282,14 +290,35 @@ def _folder_files(path: Path) -> list[Path]:
         if files := sorted(path.glob(f"*{suffix}")):
             return files
     bags = sorted(path.glob("*.bag"))
-    hint = f"open one of its files, such as {bags[0].name}" if bags else "give the folder that holds metadata.yaml"
+    if pieces := _pieces(bags):
+        return pieces
+    hint = "give the folder that holds metadata.yaml"
+    if bags:
+        hint = f"its .bag files are not numbered as pieces of one: open one of them, such as {bags[0].name}"
+    elif compressed := sorted(file for file in path.iterdir() if file.suffix in _COMPRESSED):
+        hint = f"copy its metadata.yaml too, or unpack its files, as by `unzstd {compressed[0]}`"
     raise HemislamError(f"The folder {path} is not a ROS 2 recording (it has neither metadata.yaml nor .mcap); {hint}.")
+
+
+def _pieces(bags: list[Path]) -> list[Path]:
+    """The bags of one recording, in order: a single one, or NAME_0.bag, NAME_1.bag, … of `rosbag record --split`.
+
+    Empty if they are of several. rosbag puts the time into NAME at which each piece begins.
+    """
+    if len(bags) < 2:
+        return bags
+    numbers = {int(found[1]): bag for bag in bags if (found := re.search(r"_(\d+)$", bag.stem))}
+    names = {re.sub(r"\d+", "", bag.stem) for bag in bags}
+    return [numbers[n] for n in sorted(numbers)] if len(names) == 1 and len(numbers) == len(bags) else []
 
 
 def _repair(path: Path) -> str:
     if path.is_dir():
-        inside = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
-        path = inside[0] if len(inside) == 1 else path
+        inside = sorted(file for suffix in _MAGIC for file in path.glob(f"*{suffix}"))
+        if len(inside) == 1:
+            path = inside[0]
+        elif {file.suffix for file in inside} == {".bag"}:
+            path /= "*.bag"
     return _REPAIR["" if path.is_dir() else path.suffix.lower()].format(path=path)
 
 

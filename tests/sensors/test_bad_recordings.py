@@ -100,6 +100,36 @@ def test_a_recording_in_pieces_of_which_one_is_cut_is_read_around_the_cut(
     assert abs(found - used) <= 3
 
 
+@pytest.mark.parametrize("names", [["walk_9", "walk_10"], ["2024-05-01-10-59-58_0", "2024-05-01-11-00-00_1"], ["walk"]])
+def test_the_pieces_of_a_ros_1_bag_are_read_as_one(tmp_path: Path, names: list[str]) -> None:
+    entries = rig.walk(turns=20, columns=4, ros=1)
+    for piece, name in enumerate(names):
+        share = len(entries) // len(names)
+        rig.write(tmp_path / name, entries[piece * share : (piece + 1) * share], "bag")
+    with open_recording(tmp_path, Params()) as recording:
+        assert f"{len(names)} .bag file(s)" in next(one.text for one in recording.findings if one.subject == "file")
+        assert sum(isinstance(entry, Measurement) for entry in recording.measurements()) == 20
+    last = tmp_path / f"{names[-1]}.bag"
+    last.write_bytes(last.read_bytes()[:5000])
+    assert f"`rosbag reindex {tmp_path / '*.bag' if len(names) > 1 else last}`" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("names", [["hall_0", "yard_1"], ["2024-05-01", "2024-05-02"], ["walk", "walk_1"]])
+def test_bags_of_several_recordings_are_not_mixed(tmp_path: Path, names: list[str]) -> None:
+    for name in names:
+        rig.write(tmp_path / name, rig.walk(turns=2, columns=4, ros=1), "bag")
+    assert f"such as {names[0]}.bag" in refusal(tmp_path)
+
+
+def test_files_compressed_as_a_whole_name_the_command_that_unpacks_them(tmp_path: Path) -> None:
+    folder = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4), "sqlite3-file")
+    file = folder / "walk.db3.zstd"
+    assert f"open its folder {folder}" in refusal(file)
+    (folder / "metadata.yaml").unlink()
+    assert f"`unzstd {file}`" in refusal(file)
+    assert f"`unzstd {file}`" in refusal(folder)
+
+
 def test_an_mcap_without_the_ros2_profile_is_read_all_the_same(tmp_path: Path) -> None:
     path = rig.write(tmp_path / "walk", rig.walk(turns=4, columns=12), "small-chunks")
     path.write_bytes(path.read_bytes().replace(b"\x04\x00\x00\x00ros2", b"\x04\x00\x00\x00xxxx", 1))
