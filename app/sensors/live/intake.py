@@ -61,7 +61,8 @@ class Intake:
         counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
 
     Args:
-        recorder: gets everything that comes, stamped in the engine's time.
+        recorder: gets everything that comes, stamped in the engine's time, and what the engine never gets, because no
+            sample or no scan came with it, in the sensor's own.
         counters, settled: of an intake that this one continues.
     """
 
@@ -88,6 +89,7 @@ class Intake:
         self._offset = OffsetEstimate()
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
         self._units = AS_RECORDED
+        self._units_settled = self._units_tried = False
         if settled is not None:
             self._held = None
             self._clock, self._maps, self._units = settled.clock, settled.maps, settled.units
@@ -118,6 +120,12 @@ class Intake:
         with self._changed:
             self._tell_findings("configuration", "LiDAR", findings)
             self._changed.notify()
+
+    def end(self) -> None:
+        """Record what is still held back; nothing is put any more."""
+        with self._changed:
+            while self._held:
+                self._record_unused(self._held.popleft())
 
     # --- the reader ------------------------------------------------------------------------------
 
@@ -175,15 +183,25 @@ class Intake:
         assert self._held is not None
         while len(self._held) > MAX_HELD or self._held[-1].log_ns - self._held[0].log_ns > 10 * _SETTLE_NS:
             old = self._held.popleft()
+            self._record_unused(old)
             if isinstance(old, ScanEntry):
                 self.counters.dropped += 1
                 self._rest.append(DroppedScan(old.scan.stamp_ns, NO_IMU))
         # Thousands of samples may be held; going through all of them at each scan is enough.
         if not isinstance(self._held[-1], ScanEntry):
             return False
-        samples = [entry for entry in self._held if isinstance(entry, ImuEntry)]
         scans = sum(isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan) for entry in self._held)
-        if scans < _SETTLE_SCANS or len(samples) < 20:
+        if scans < _SETTLE_SCANS or not self._settle_units():
+            return False
+        self._settle_clock()
+        return True
+
+    def _settle_units(self) -> bool:
+        """Whether the units are known, once there is a second of samples."""
+        if self._units_settled or self._held is None:
+            return True
+        samples = [entry for entry in self._held if isinstance(entry, ImuEntry)]
+        if len(samples) < 20:
             return False
         if abs(samples[-1].stamp_ns - samples[0].stamp_ns) < _SETTLE_NS:
             if not self._still_reported and samples[-1].log_ns - samples[0].log_ns > 5 * _SETTLE_NS:
@@ -205,8 +223,20 @@ class Intake:
                 self._tell("units", "IMU", str(error))
             return False
         self._tell_findings("units", "IMU", findings)
-        self._settle_clock()
+        self._units_settled = True
         return True
+
+    def _record_unused(self, entry: ScanEntry | ImuEntry) -> None:
+        """Record what the reader does not get, in the sensor's own time, as the clock is not settled."""
+        if self._recorder is None:
+            return
+        if isinstance(entry, ImuEntry):
+            if not self._units_tried:  # no scan came to do it
+                self._units_tried = True
+                self._settle_units()
+            self._recorder.add_imu(entry.stamp_ns, *self._units.apply(entry.gyro, entry.accel), entry.log_ns)
+        elif isinstance(entry.scan, Scan):
+            self._recorder.add_scan(entry.scan, entry.log_ns)
 
     def _settle_clock(self) -> None:
         offset = self._offset.seconds() or 0.0

@@ -99,6 +99,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         self._stop.set()
         for thread in self._threads:
             thread.join(5.0)
+        self._intake.end()
         if self._recorder is not None:
             self._recorder.close()
 

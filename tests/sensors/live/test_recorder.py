@@ -16,8 +16,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from app.sensors.live import recorder as recorder_module
+from app.sensors.live.intake import Intake
 from app.sensors.live.recorder import MAX_SCANS, Recorder
+from app.sensors.live.source import LiveSource
 from app.sensors.recording import open_recording
+from app.sensors.ros import IMU_TOPIC, LIDAR_TOPIC, stamp_ns
+from app.sensors.source import Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement, Scan
@@ -69,6 +73,42 @@ def test_a_session_reads_again_as_it_was(tmp_path: Path) -> None:
         types = {connection.topic: connection.msgtype for connection in reader.connections}
         assert types == {"/rslidar_points": "sensor_msgs/msg/PointCloud2", "/imu/data": "sensor_msgs/msg/Imu"}
         assert reader.message_count == 12 * 21
+
+
+@pytest.mark.parametrize("imu_from", [None, 13])
+def test_scans_that_no_sample_covers_are_recorded_too(tmp_path: Path, imu_from: int | None) -> None:
+    recorder = Recorder(tmp_path / "session.mcap")
+    intake = Intake(Params(), recorder=recorder)
+    with LiveSource([], intake, Params(), recorder):
+        for turn in range(150):
+            if imu_from is not None and turn >= imu_from * 10:
+                put_samples(intake, turn, 9.81)
+            intake.put_scan(scan(turn), sensor.START_NS + (turn + 1) * TURN_NS)
+    with Source(recorder.path) as source:
+        found = [message for _, _, message in source.messages((LIDAR_TOPIC,))]
+        samples = sum(1 for _ in source.messages((IMU_TOPIC,)))
+    assert [stamp_ns(message.header.stamp) for message in found] == [scan(turn).end_ns for turn in range(150)]
+    assert samples == (400 if imu_from else 0)
+
+
+def test_samples_of_an_imu_that_waits_long_for_the_lidar_are_recorded_in_one_unit(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "session.mcap")
+    intake = Intake(Params(), recorder=recorder)
+    with LiveSource([], intake, Params(), recorder):
+        for turn in range(150):
+            put_samples(intake, turn, 1.0)
+            if turn >= 130:
+                intake.put_scan(scan(turn), sensor.START_NS + (turn + 1) * TURN_NS)
+    with Source(recorder.path) as source:
+        found = [message.linear_acceleration.z for _, _, message in source.messages((IMU_TOPIC,))]
+    assert len(found) == 3000
+    assert found == pytest.approx([9.80665] * 3000)
+
+
+def put_samples(intake: Intake, turn: int, up: float) -> None:
+    for k in range(20):
+        stamp = sensor.START_NS + turn * TURN_NS + k * 5_000_000
+        intake.put_imu(stamp, (0.0, 0.0, 0.001 * k), (0.0, 0.0, up), stamp)
 
 
 def test_the_index_of_the_chunks_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
