@@ -22,12 +22,15 @@ ABSURD = 1e6
 """No IMU reads more than this, in any unit."""
 ACCELERATION_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}
 GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
+_GYROSCOPE_OPTION = "--set recording.gyroscope_unit="
 
 MOST_ACCEL = 200.0
 """m/s^2; a larger value is no walking motion."""
 WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
 """Accelerations are averaged over a window, about a step of walking, and compared with those one span later."""
 GAP_NS = 1_000_000_000
+DOUBTFUL, TOO_FAST = 3.0, 10.0
+"""rad/s: a gyroscope that reads more than the first may be in deg/s; no hand turns faster than the second."""
 CLEARLY = 0.5
 """Another unit or other axes are proposed if they leave less than this share of the error."""
 LEAST_ERROR = 0.3
@@ -152,20 +155,27 @@ def _acceleration_unit(norm: float, chosen: str) -> tuple[float, list[Finding]]:
 
 def _gyroscope_unit(gyro: F64, sway: "Sway | None", chosen: str) -> tuple[float, list[Finding]]:
     """The factor to rad/s, by how gravity turns, or by what a hand can do."""
-    option = "--set recording.gyroscope_unit="
     if chosen != "auto":
         return GYROSCOPE_UNITS[chosen], []
-    turning = float(np.percentile(np.linalg.norm(gyro, axis=1), 90))
+    turning = turning_rate(gyro)
     if sway is None:
-        if turning > 10.0:
-            text = f"the gyroscope reads {turning:.0f} at the start, too fast for a hand in rad/s: it may be in deg/s"
-            return 1.0, [Finding("IMU units", "needs you", text, f"{option}deg/s")]
-        return 1.0, []
+        return 1.0, [too_fast(turning, " at the start")] if turning > TOO_FAST else []
     errors = {unit: sway.error(scale) for unit, scale in GYROSCOPE_UNITS.items()}
-    if turning > 3.0 and errors["deg/s"] < CLEARLY * errors["rad/s"]:
+    if turning > DOUBTFUL and errors["deg/s"] < CLEARLY * errors["rad/s"]:
         text = "the gyroscope is in deg/s, by how gravity turns in the IMU's axes; scaled to rad/s"
-        return GYROSCOPE_UNITS["deg/s"], [Finding("IMU units", "corrected", text, f"{option}rad/s")]
+        return GYROSCOPE_UNITS["deg/s"], [Finding("IMU units", "corrected", text, f"{_GYROSCOPE_OPTION}rad/s")]
     return 1.0, []
+
+
+def turning_rate(gyro: F64) -> float:
+    """What a tenth of the samples (k, 3) exceed, in their unit."""
+    return float(np.percentile(np.linalg.norm(gyro, axis=1), 90))
+
+
+def too_fast(rate: float, when: str = "") -> Finding:
+    """A gyroscope taken as in rad/s reads more than `TOO_FAST`."""
+    text = f"the gyroscope reads {rate:.0f}{when}, too fast for a hand in rad/s: it may be in deg/s"
+    return Finding("IMU units", "needs you", text, f"{_GYROSCOPE_OPTION}deg/s")
 
 
 def _axes_finding(sway: "Sway", gyro_unit: float, chosen: RecordingParams) -> list[Finding]:

@@ -4,6 +4,7 @@ When the engine falls behind, the oldest waiting scans are dropped, each reporte
 not, unless nobody reads them for minutes.
 """
 
+import math
 import threading
 import time
 from collections import deque
@@ -16,7 +17,17 @@ import numpy as np
 
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
-from app.sensors.imu_units import AS_RECORDED, ImuProbe, ImuUnits, measured, settle_imu
+from app.sensors.imu_units import (
+    AS_RECORDED,
+    DOUBTFUL,
+    TOO_FAST,
+    ImuProbe,
+    ImuUnits,
+    measured,
+    settle_imu,
+    too_fast,
+    turning_rate,
+)
 from app.sensors.live.clock import JUMP_NS, ClockMap, OffsetEstimate
 from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Counters, Kind, LiveState, Status
@@ -33,6 +44,10 @@ MAX_HELD = 50_000
 """Entries that may wait for the start: 10 s of an IMU at 5 kHz. A clock that is set back could make it more."""
 _SETTLE_NS = 1_000_000_000
 _SETTLE_SCANS = 3
+_SWAY_NS = 2_000_000_000
+"""The samples must be as long as this to tell a gyroscope's unit."""
+_TOO_FAST_SAMPLES = 20
+"""So many in turn that are too fast are no knock."""
 BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
 
 Clock = Literal["auto", "sensor", "host"]
@@ -54,8 +69,8 @@ class Settled:
 class Intake:
     """Receiving threads call `put_...`; one reader calls `take`.
 
-    For the first second it holds everything back, until it knows the accelerometer's unit and whether the clocks of
-    the two sensors agree. The log time of what it holds is that of its arrival.
+    For the first second, or two if the gyroscope may be in deg/s, it holds everything back, until it knows the units
+    and whether the clocks of the two sensors agree. The log time of what it holds is that of its arrival.
 
     Attributes:
         counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
@@ -90,6 +105,7 @@ class Intake:
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
         self._units = AS_RECORDED
         self._units_settled = self._units_tried = False
+        self._too_fast, self._unit_reported = 0, params.recording.gyroscope_unit != "auto"
         if settled is not None:
             self._held = None
             self._clock, self._maps, self._units = settled.clock, settled.maps, settled.units
@@ -203,7 +219,8 @@ class Intake:
         samples = [entry for entry in self._held if isinstance(entry, ImuEntry)]
         if len(samples) < 20:
             return False
-        if abs(samples[-1].stamp_ns - samples[0].stamp_ns) < _SETTLE_NS:
+        span_ns = abs(samples[-1].stamp_ns - samples[0].stamp_ns)
+        if span_ns < _SETTLE_NS:
             if not self._still_reported and samples[-1].log_ns - samples[0].log_ns > 5 * _SETTLE_NS:
                 self._still_reported = True
                 self._tell("clocks", "IMU", "the IMU's stamps do not advance; check its driver")
@@ -214,6 +231,8 @@ class Intake:
         good = measured(gyro, accel)
         if not good.any():
             return False
+        if span_ns < _SWAY_NS and turning_rate(gyro[good]) > DOUBTFUL and not self._unit_reported:
+            return False
         probe = ImuProbe(stamps[good], stamps[good], gyro[good], accel[good])
         try:
             self._units, findings = settle_imu(probe, self._params.recording)
@@ -223,6 +242,7 @@ class Intake:
                 self._tell("units", "IMU", str(error))
             return False
         self._tell_findings("units", "IMU", findings)
+        self._unit_reported |= any("deg/s" in finding.text for finding in findings)
         self._units_settled = True
         return True
 
@@ -272,6 +292,11 @@ class Intake:
         gyro, accel = self._units.apply(entry.gyro, entry.accel)
         if self._recorder is not None:
             self._recorder.add_imu(stamp, gyro, accel, entry.log_ns)
+        rate = math.hypot(*gyro)
+        self._too_fast = self._too_fast + 1 if rate > TOO_FAST else 0
+        if self._too_fast == _TOO_FAST_SAMPLES and not self._unit_reported:
+            self._unit_reported = True
+            self._tell_findings("units", "IMU", [too_fast(rate)])
         self._rest.append(ImuEntry(entry.log_ns, stamp, gyro, accel))
 
     def _release_scan(self, entry: ScanEntry) -> None:

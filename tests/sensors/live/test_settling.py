@@ -1,0 +1,59 @@
+"""What a live source learns of its sensors in the first seconds, and what it says if it learns too little."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from app.sensors.live.intake import Intake
+from app.sensors.live.status import Status
+from app.sensors.recording import ImuEntry
+from app.slam.params import Params
+from app.slam.types import Scan
+from tests.sensors.live import sensor
+
+MILLISECOND_NS = 1_000_000
+DEGREES = 180 / np.pi
+
+
+def scan(stamp_ns: int) -> Scan:
+    points, offsets = np.ones((10, 3), np.float32), np.linspace(0, 1e8, 10).astype(np.int32)
+    return Scan(stamp_ns, points, offsets, points[:, 0], np.zeros(10, np.uint16))
+
+
+def sway(intake: Intake, rest_s: float, unit: float) -> tuple[list[str], list[ImuEntry]]:
+    """News and samples of six seconds in which a hand turns the device, after it has been at rest."""
+    noise = np.random.default_rng(0)
+    turned = Rotation.identity()
+    for k in range(1200):
+        now = sensor.START_NS + k * 5 * MILLISECOND_NS
+        at = k * 0.005
+        rates = np.array([0.6 * np.sin(2 * at), 0.8 * np.sin(1.3 * at), 0.5 * np.cos(at)]) * (at >= rest_s)
+        turned *= Rotation.from_rotvec(rates * 0.005)
+        gyro, accel = rates * unit, turned.inv().apply([0.0, 0.0, 9.81])
+        (x, y, z), (u, v, w) = gyro + noise.normal(size=3) * 1e-3, accel + noise.normal(size=3) * 0.02
+        intake.put_imu(now, (x, y, z), (u, v, w), now)
+        if k % 20 == 19:
+            intake.put_scan(scan(now - 100 * MILLISECOND_NS), now)
+    found, _ = intake.take(0.0, scan=False)
+    return [e.text for e in found if isinstance(e, Status)], [e for e in found if isinstance(e, ImuEntry)]
+
+
+def test_a_gyroscope_in_degrees_is_found_if_the_device_turns_from_the_start() -> None:
+    (text,), samples = sway(Intake(Params()), 0.0, DEGREES)
+    assert "in deg/s, by how gravity turns" in text
+    assert len(samples) == 1200
+    assert np.abs([sample.gyro for sample in samples]).max() < 1.0
+
+
+def test_a_gyroscope_in_degrees_that_rested_first_is_suspected_once() -> None:
+    (text,), _ = sway(Intake(Params()), 2.5, DEGREES)
+    assert "too fast for a hand in rad/s: it may be in deg/s --set recording.gyroscope_unit=deg/s" in text
+
+
+@pytest.mark.parametrize(
+    ("rest_s", "unit", "chosen"), [(2.5, 1.0, "auto"), (0.0, 1.0, "auto"), (2.5, DEGREES, "deg/s")]
+)
+def test_of_a_gyroscope_in_order_nothing_is_said(rest_s: float, unit: float, chosen: str) -> None:
+    news, samples = sway(Intake(Params().with_values({"recording.gyroscope_unit": chosen})), rest_s, unit)
+    assert news == []
+    assert len(samples) == 1200
