@@ -26,6 +26,8 @@ from app.slam.params import Params
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 MAX_MESSAGE = 256 << 20
 RETRY_S = 1.0
+_MOST_DELAY_NS = 800_000_000
+"""Of a network; log times that are older are not trusted."""
 MESSAGE = struct.Struct("<BIQ")
 
 Sensor = Literal["lidar", "imu"]
@@ -61,6 +63,7 @@ class FoxgloveReceiver:
         self._subscribed: dict[int, tuple[Sensor, Channel]] = {}
         self._reader: CloudReader | None = None
         self._last_status = ""
+        self._least_delay_ns = 0
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         connected = False
@@ -83,6 +86,7 @@ class FoxgloveReceiver:
     def _listen(self, connection: Connection, intake: Intake, stop: threading.Event) -> None:
         """One connection, until it ends."""
         self._channels, self._subscribed = {}, {}
+        self._least_delay_ns = time.time_ns()
         begun = time.monotonic()
         while not stop.is_set():
             try:
@@ -147,7 +151,7 @@ class FoxgloveReceiver:
             self._report("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it", intake)
 
     def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int, intake: Intake) -> None:
-        arrival = time.time_ns()
+        arrival = self._arrival(log_ns)
         try:
             message = self._deserialiser.read(data, channel.type, channel.encoding)
         except Exception:  # rosbags lets those of struct, numpy and asserts through
@@ -162,6 +166,18 @@ class FoxgloveReceiver:
         for scan, arrival_ns in self._reader.add(message, log_ns, arrival, intake):
             intake.counters.frames += 1
             intake.put_scan(scan, arrival_ns)
+
+    def _arrival(self, log_ns: int) -> int:
+        """When a message arrived, by the host's clock, or would have if the network were as fast as it once was.
+
+        Large clouds take longer than IMU samples; the log time is that at which the server had them.
+        """
+        now = time.time_ns()
+        if not log_ns:
+            return now
+        self._least_delay_ns = min(self._least_delay_ns, now - log_ns)
+        arrival = log_ns + self._least_delay_ns
+        return arrival if now - arrival < _MOST_DELAY_NS else now
 
     def _report(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
         """Put news into the intake, once however often it happens."""

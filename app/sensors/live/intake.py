@@ -48,6 +48,8 @@ _SWAY_NS = 2_000_000_000
 """The samples must be as long as this to tell a gyroscope's unit."""
 _TOO_FAST_SAMPLES = 20
 """So many in turn that are too fast are no knock."""
+_AHEAD_NS, _LATE_NS = -50_000_000, 2_000_000_000
+"""Stamps whose age on arrival is between these are taken as the time of day."""
 BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
 
 Clock = Literal["auto", "sensor", "host"]
@@ -263,13 +265,26 @@ class Intake:
         apart = abs(offset) > TOLERANCE_S
         wrong = f"the IMU's stamps are {abs(offset):.3f} s {'behind' if offset > 0 else 'ahead of'} the LiDAR's"
         if self._clock == "auto":
-            self._clock = "host" if apart else "sensor"
-            if apart:
+            late = offset < 0 and self._stamps_are_of_day()
+            self._clock = "host" if apart and not late else "sensor"
+            if apart and late:
+                text = (
+                    f"the scans arrive {-offset:.3f} s after the IMU's samples of the same time, as over a slow network"
+                )
+                self._tell("clocks", "source", f"{text}; the stamps are used: if they are wrong, use ?clock=host")
+            elif apart:
                 self._tell("clocks", "source", f"{wrong}: both are stamped by the host's clock instead, on arrival")
         elif self._clock == "sensor" and apart:
             self._tell("clocks", "source", f"{wrong}; use ?clock=host, or --set recording.imu_time_offset={offset:.3f}")
         for clock_map in self._maps.values():
             clock_map.host = self._clock == "host"
+
+    def _stamps_are_of_day(self) -> bool:
+        """Whether both sensors' stamps are the time of day, some seconds old at most."""
+        held = self._held or ()
+        scans = [e.log_ns - e.scan.end_ns for e in held if isinstance(e, ScanEntry) and isinstance(e.scan, Scan)]
+        samples = [entry.log_ns - entry.stamp_ns for entry in held if isinstance(entry, ImuEntry)]
+        return all(_AHEAD_NS < np.median(ages) < _LATE_NS for ages in (scans, samples))
 
     def _release(self, entry: ScanEntry | ImuEntry) -> None:
         """Stamp it in the engine's time and pass it to the recorder and the reader."""

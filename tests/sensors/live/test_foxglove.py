@@ -18,6 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.server import Server, ServerConnection, serve
 
+from app.sensors import ros
 from app.sensors.live.foxglove import Channel
 from app.sensors.live.foxglove_server import FoxgloveServer
 from app.sensors.live.source import Event
@@ -139,6 +140,26 @@ def test_livoxs_own_message_arrives_point_by_point(ros: int) -> None:
         assert measurement.scan.stamp_ns == truth.begin_ns
         np.testing.assert_array_equal(measurement.scan.points, truth.points.astype(np.float32))
         np.testing.assert_array_equal(measurement.scan.offsets_ns, truth.offsets_ns)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_clouds_that_arrive_late_count_from_when_the_server_had_them(stated: bool) -> None:
+    """The stamps are not the time of day, so that they cannot show it."""
+    entries = rig.walk(turns=16, columns=30)
+    late_ns = {"/points": 300_000_000, "/imu": 0}
+    kinds = {topic: message.__msgtype__ for topic, _, message in entries}
+    channels = [Channel(n, topic, "cdr", kinds[topic], ros.definition(kinds[topic])) for n, topic in enumerate(late_ns)]
+    with (
+        FoxgloveServer("127.0.0.1", 0, channels) as server,
+        open_live(f"foxglove://127.0.0.1:{server.port}", Params()) as source,
+    ):
+        assert server.wait_for_subscribers(10.0)
+        begun = time.monotonic_ns() - entries[0][1]
+        for topic, log_ns, message in sorted(entries, key=lambda entry: entry[1] + late_ns[entry[0]]):
+            time.sleep(max(begun + log_ns + late_ns[topic] - time.monotonic_ns(), 0) * 1e-9)
+            server.publish([*late_ns].index(topic), log_ns if stated else 0, ros.serialised(message))
+        ports.collect(source, enough(10))
+        assert source.state().clock == ("sensor" if stated else "host")
 
 
 def test_nonsense_from_a_server_is_passed_over() -> None:

@@ -57,3 +57,37 @@ def test_of_a_gyroscope_in_order_nothing_is_said(rest_s: float, unit: float, cho
     news, samples = sway(Intake(Params().with_values({"recording.gyroscope_unit": chosen})), rest_s, unit)
     assert news == []
     assert len(samples) == 1200
+
+
+def play(lidar_s: float, imu_s: float, cloud_delay_s: float = 0.005) -> tuple[str, list[str]]:
+    """Which clock is used, and the news, if the stamps are so far ahead of the host's clock."""
+    intake, events = Intake(Params()), []
+    noise = np.random.default_rng(0)
+    for k in range(400):
+        now = sensor.START_NS + k * 5 * MILLISECOND_NS
+        events.append((now + 2 * MILLISECOND_NS, "imu", now + round(imu_s * 1e9)))
+        if k % 20 == 19:
+            stamp = now - 100 * MILLISECOND_NS + round(lidar_s * 1e9)
+            events.append((now + round(cloud_delay_s * 1e9), "lidar", stamp))
+    for arrival, name, stamp in sorted(events):
+        if name == "lidar":
+            intake.put_scan(scan(stamp), arrival)
+            continue
+        (wx, wy, wz), (x, y, z) = noise.normal(size=(2, 3)) * 1e-2
+        intake.put_imu(stamp, (wx, wy, wz), (x, y, 9.81 + z), arrival)
+    found, _ = intake.take(0.0, scan=False)
+    return intake.state().clock, [entry.text for entry in found if isinstance(entry, Status)]
+
+
+def test_clouds_that_a_slow_network_delays_keep_their_stamps() -> None:
+    clock, (text,) = play(0.0, 0.0, cloud_delay_s=0.3)
+    assert clock == "sensor"
+    assert "as over a slow network" in text and "?clock=host" in text
+    assert play(0.0, 0.0) == ("sensor", [])
+
+
+@pytest.mark.parametrize(("lidar_s", "imu_s"), [(0.0, 0.3), (0.0, -0.5), (-3.0, 0.0), (-1e9, 0.0), (0.0, -1e9)])
+def test_a_clock_that_is_wrong_is_not_taken_for_a_slow_network(lidar_s: float, imu_s: float) -> None:
+    clock, (text,) = play(lidar_s, imu_s)
+    assert clock == "host"
+    assert "stamped by the host's clock instead" in text
