@@ -27,6 +27,9 @@ from app.slam.sections import ImuParams
 from app.slam.types import F64, I64, DroppedScan, Scan
 
 MOST_IN_BATCH = 50
+"""Samples that are read at a time."""
+MOST_BEHIND = 20
+"""Samples that may be left out because their stamps step back: a tenth of a second, over which the filter coasts."""
 DAMAGE = "file"
 """Subject of what is wrong with the file itself."""
 
@@ -214,6 +217,13 @@ def _imu_time(counts: Counts) -> Finding:
         (counts.imu_duplicates, "repeated stamps"),
         (counts.imu_invalid, "NaN samples"),
     )
+    if counts.imu_behind > MOST_BEHIND:
+        text = (
+            f"{wrong}; the {counts.imu_behind} samples until the stamps have caught up are left out, and what was "
+            "walked meanwhile is missing: if the clock was set back, map the parts before and after it by --start and "
+            "--duration"
+        )
+        return Finding("IMU time", "needs you", text)
     text = f"{wrong}; those samples are left out" if wrong else "the stamps only ever rise"
     return Finding("IMU time", "corrected" if wrong else "fine", text)
 

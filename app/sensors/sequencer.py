@@ -50,6 +50,7 @@ class Counts:
 
     imu_duplicates: int = 0
     imu_back_steps: int = 0
+    imu_behind: int = 0
     imu_far_off: int = 0
     imu_invalid: int = 0
     imu_weightless: int = 0
@@ -140,7 +141,9 @@ class Sequencer:
         if newest is not None and stamp_ns <= newest:
             if stamp_ns == newest:
                 self.counts.imu_duplicates += 1
-            elif not self._behind:
+                return
+            self.counts.imu_behind += 1
+            if not self._behind:
                 back = (newest - stamp_ns) / 1e9
                 self._count("imu_back_steps", f"IMU time stepped back by {back:.4f} s; samples until then left out")
                 self._behind = True

@@ -114,6 +114,17 @@ def test_zeros_in_place_of_imu_samples_are_named_and_are_a_gap(tmp_path: Path) -
     assert found["IMU gaps"].verdict == "needs you" and found["pairing"].verdict == "fine"
 
 
+def test_a_clock_that_is_set_back_loses_a_part_of_the_walk_and_that_is_said(tmp_path: Path) -> None:
+    entries = rig.walk(turns=30, columns=4)
+    for _, log_ns, sent in entries:
+        stamp_ns = sent.header.stamp.sec * 10**9 + sent.header.stamp.nanosec
+        if log_ns > rig.START_NS + 1_500_000_000:
+            sent.header = rig.header(stamp_ns - 500_000_000, 2)
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert found["IMU time"].verdict == "needs you"
+    assert "samples until the stamps have caught up are left out" in found["IMU time"].text
+
+
 def test_an_imu_that_stops_for_good_is_a_gap_to_the_end(tmp_path: Path) -> None:
     found = by_subject(rig.write(tmp_path / "walk", rig.walk(turns=20, columns=4, imu_stop_ns=1_000_000_000)))
     assert found["IMU gaps"].verdict == "needs you" and "1 longer than 0.1 s" in found["IMU gaps"].text
