@@ -3,10 +3,11 @@
 from dataclasses import dataclass, fields
 from typing import Annotated
 
-from pydantic import Field, PlainSerializer, PlainValidator
+from pydantic import PlainSerializer, PlainValidator
 
 from app.export.box import Box
 from app.mapping.painted import Stroke, entry_of, stroke_of
+from app.slam.errors import HemislamError
 from app.slam.types import Vector
 
 
@@ -45,12 +46,19 @@ class Clip:
     Attributes:
         box: None: none was chosen yet. on: whether what is outside it is hidden.
         unrolled: the map is shown as a profile along the walked path. slab: m, how wide that is.
+
+    Raises:
+        HemislamError: the slab is too thin or too thick.
     """
 
     box: Box | None = None
     on: bool = False
     unrolled: bool = False
-    slab: Annotated[float, Field(ge=0.01, le=100)] = 1.0
+    slab: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.01 <= self.slab <= 100:
+            raise HemislamError(f"A slab cannot be {self.slab:g} m thick; give 0.01 to 100.")
 
     @property
     def hiding(self) -> Box | None:

@@ -21,11 +21,12 @@ from app.ui.geometry import wxyz
 from app.ui.html import panel
 from app.ui.measure import MeasurePanel
 from app.ui.nodes import add_lines
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, notify_error, show
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, limited, notify_error, show
 
 _NODE: Final = f"{ROOT}/clip"
 _COLOUR: Final = (255, 205, 80)
 _HANDLE_PX: Final = 70.0
+_FAR_M: Final = 1e5
 _MIDDLE: Final = -1
 """Number of the handle in the middle; the others are those of `FACES`."""
 
@@ -58,16 +59,20 @@ class ClipPanel:
         self._on = gui.add_checkbox("clip box", False, hint="Hide what is outside. Exports can be limited to it.")
         self._fields = gui.add_folder(None, visible=False)
         with self._fields:
-            self._middle = gui.add_vector3("middle (m)", (0.0, 0.0, 0.0), step=0.05)
-            self._size = gui.add_vector3("size (m)", (1.0, 1.0, 1.0), min=(0.05, 0.05, 0.05), step=0.05)
-            self._turn = gui.add_number("turn (°)", 0.0, min=-360.0, max=360.0, step=1.0)
+            self._middle = limited(
+                gui.add_vector3("middle (m)", (0.0,) * 3, min=(-_FAR_M,) * 3, max=(_FAR_M,) * 3, step=0.05)
+            )
+            self._size = limited(gui.add_vector3("size (m)", (1.0,) * 3, min=(0.05,) * 3, max=(_FAR_M,) * 3, step=0.05))
+            self._turn = limited(gui.add_number("turn (°)", 0.0, min=-360.0, max=360.0, step=1.0))
             self._pull = gui.add_checkbox("handles", True, hint="Arrows move the sides, the one in the middle the box.")
             add_button(gui, "Look from its front", self.look, viser.Icon.VIEWPORT_NARROW)
             save = viser.Icon.DEVICE_FLOPPY
             add_button(gui, "Save as a section…", lambda client: ask_where(client, "section"), save)
             add_button(gui, "Around the whole map", lambda _: self._send(box=self._whole()), viser.Icon.MAXIMIZE)
-        self._slab = gui.add_number(
-            "slab (m)", 1.0, min=0.05, max=100.0, step=0.05, hint="How thick a cut section or the profile is."
+        self._slab = limited(
+            gui.add_number(
+                "slab (m)", 1.0, min=0.05, max=100.0, step=0.05, hint="How thick a cut section or the profile is."
+            )
         )
         hint = "Click two points: the clip box becomes the slab between."
         add_button(gui, "Cut by two clicks", self._begin_cut, viser.Icon.SLICE, hint=hint)

@@ -19,7 +19,7 @@ from app.slam.trajectory import truth_beside
 from app.ui.html import panel
 from app.ui.nodes import clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import Changes, Page, add_button, by_user, dialog
+from app.ui.widgets import Changes, Page, add_button, by_user, dialog, limited
 
 _MOST_ENTRIES: Final = 60
 _RECENT: Final = 3
@@ -219,8 +219,15 @@ class FilesPanel:
                 initial_value=titles.get(format, _OF_A_RUN),
                 hint="Those of a run, or one in the format of other programs.",
             )
-            thin = gui.add_number(
-                "thin to (m)", 0.0, min=0.0, max=100.0, step=0.01, hint="One point in each voxel of this size; 0: all."
+            thin = limited(
+                gui.add_number(
+                    "thin to (m)",
+                    0.0,
+                    min=0.0,
+                    max=100.0,
+                    step=0.01,
+                    hint="One point in each voxel of this size; 0: all.",
+                )
             )
             boxed = gui.add_checkbox(
                 "inside the clip box", clip.on, visible=clip.box is not None, hint="Only points that are in it."

@@ -22,7 +22,7 @@ from app.ui.loops.words import describe_edit
 from app.ui.measure import MeasurePanel
 from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, show
+from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, limited, show
 
 NOTHING, RECORDED, FILE, CONTROL = "nothing", "fixes of the recording", "fixes of a file", "control points"
 _ALIGN, _FACTORS = "align only", "as factors"
@@ -77,7 +77,7 @@ class GeoreferencePanel:
         )
         self._name = gui.add_dropdown("control point", ("–",))
         self._fit = gui.add_dropdown("pick", (_POINT, _SPHERE), hint="By a click on the map.")
-        self._radius = gui.add_number("sphere's radius (m)", 0.0725, min=0.01, max=1.0, step=0.0005)
+        self._radius = limited(gui.add_number("sphere's radius (m)", 0.0725, min=0.01, max=1.0, step=0.0005))
         self._pick = add_button(gui, "Pick it on the map", lambda _: self._begin_pick(), viser.Icon.MAP_PIN, color=None)
         self._bridge = Bridge(gui, "georeference", self._act)
         self._html = gui.add_html("")

@@ -18,7 +18,7 @@ from app.ui.colours import DENSITY, DISTANCE, MODES, TABLES, Limits, value_colou
 from app.ui.files import FileList
 from app.ui.html import Tile, number, panel
 from app.ui.map_numbers import Density, MapNumbers
-from app.ui.widgets import Changes, Page, View, add_button, dialog
+from app.ui.widgets import Changes, Page, View, add_button, dialog, limited
 
 _BINS: Final = 41
 _LEAST_M: Final = 0.005
@@ -54,8 +54,10 @@ class MapComparePanel:
         self._fit = gui.add_checkbox(
             "fit it first", False, hint="Move the other map onto this one; they must lie within 2 m and a few degrees."
         )
-        self._reach = gui.add_number(
-            "reach (m)", REACH_M, min=0.05, max=5.0, step=0.05, hint="What is farther has no counterpart."
+        self._reach = limited(
+            gui.add_number(
+                "reach (m)", REACH_M, min=0.05, max=5.0, step=0.05, hint="What is farther has no counterpart."
+            )
         )
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._stop = add_button(gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False)

@@ -20,7 +20,7 @@ from app.ui.colours import Key
 from app.ui.files import result_folder_name, size_text
 from app.ui.html import panel
 from app.ui.picture_maths import Station, composed, flight
-from app.ui.widgets import Changes, Page, add_button, notify_error
+from app.ui.widgets import Changes, Page, add_button, limited, notify_error
 
 _LARGEST: Final = 8192
 _MOST_PIXELS: Final = 6144 * 4096
@@ -47,13 +47,15 @@ class PicturesPanel:
         self._stopped = threading.Event()
         self._share, self._saved = 0.0, Path()
         self._changes = Changes()
-        self._width = gui.add_number("width", 1920, min=64, max=_LARGEST, step=1, hint="Pixels.")
-        self._height = gui.add_number("height", 1080, min=64, max=_LARGEST, step=1, hint="Pixels.")
+        self._width = limited(gui.add_number("width", 1920, min=64, max=_LARGEST, step=1, hint="Pixels."))
+        self._height = limited(gui.add_number("height", 1080, min=64, max=_LARGEST, step=1, hint="Pixels."))
         self._explain = gui.add_checkbox("with legend and scale", True)
         shoot = partial(self._reporting, act=self._shoot)
         add_button(gui, "Take a picture", shoot, viser.Icon.CAMERA, hint="A PNG of this view.")
         self._way = gui.add_dropdown("fly with", tuple(_WAYS))
-        self._seconds = gui.add_number("seconds", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures each.")
+        self._seconds = limited(
+            gui.add_number("seconds", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures each.")
+        )
         hint = "Numbered PNGs in a zip file, in this size. Keep this tab in front."
         fly = partial(self._reporting, act=self._fly)
         self._start = add_button(gui, "Fly along the path", fly, viser.Icon.MOVIE, hint=hint)

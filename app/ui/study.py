@@ -29,7 +29,18 @@ from app.ui.study_maths import (
     study_colours,
     study_legend,
 )
-from app.ui.widgets import PANEL_PERIOD_S, ROOT, SCENE_PERIOD_S, Changes, Page, View, by_user, chart, choose_next
+from app.ui.widgets import (
+    PANEL_PERIOD_S,
+    ROOT,
+    SCENE_PERIOD_S,
+    Changes,
+    Page,
+    View,
+    by_user,
+    chart,
+    choose_next,
+    limited,
+)
 
 _POINT: Final = (255, 255, 255)
 _NEIGHBOURS: Final = (255, 92, 141)
@@ -114,7 +125,9 @@ class StudyPanel:
         self._plot = _plot(gui, curve(None, 0.025))
         self._summary = gui.add_html(panel("quiet", _PAUSE))
         gui.add_html(heading("A point"))
-        self._neighbours = gui.add_number("neighbours", 20, min=4, max=200, step=1, hint="Nearest points of this scan.")
+        self._neighbours = limited(
+            gui.add_number("neighbours", 20, min=4, max=200, step=1, hint="Nearest points of this scan.")
+        )
         self._point = gui.add_html(panel("quiet", _ASK))
         gui.add_html(heading("Download this frame with all its points' numbers"))
         self._save = gui.add_button_group("save", ("PLY", "PCD"), hint="In the LiDAR frame.")

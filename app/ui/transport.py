@@ -21,7 +21,7 @@ from app.server.protocol import (
 )
 from app.ui.html import number, panel, source
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, as_set, show
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, as_set, limited, show
 
 SPEEDS: Final = {
     "0.1×": 0.1,
@@ -167,8 +167,8 @@ class BreakpointPanel:
         for one in BREAKPOINTS:
             self._switches[one.name] = gui.add_checkbox(one.title, False, hint=one.hint)
             if (limit := one.limit) is not None:
-                self._numbers[one.name] = gui.add_number(
-                    limit.unit or "limit", limit.default, min=0.0, step=limit.step, visible=False
+                self._numbers[one.name] = limited(
+                    gui.add_number(limit.unit or "limit", limit.default, min=0.0, step=limit.step, visible=False)
                 )
         controls: list[Any] = [*self._switches.values(), *self._numbers.values()]
         for control in controls:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import viser
@@ -111,6 +111,7 @@ class Page:
             notify_error(client, error)
 
 
+_NumberBox = TypeVar("_NumberBox", bound=viser.GuiNumberHandle[Any] | viser.GuiVector3Handle)
 _PLAIN: Final = (str, int, float, Enum, frozenset, View, Limits)
 
 
@@ -153,6 +154,21 @@ def show(control: Any, value: Any) -> None:
     """Make a control show `value`. Its callbacks then run with `client=None`; `by_user` ignores those."""
     if control.value != value:
         control.value = value
+
+
+def limited(box: _NumberBox) -> _NumberBox:
+    """A number box that keeps to its limits: what is typed beyond them becomes the nearest that is allowed.
+
+    viser applies them to its arrows alone. Its event loop waits for this callback and only then calls later ones.
+    """
+    low, high = (-np.inf if box.min is None else box.min), (np.inf if box.max is None else box.max)
+    control: Any = box  # mypy overlooks viser's setter
+
+    async def keep_within(_: object) -> None:
+        control.value = np.clip(control.value, low, high)
+
+    box.on_update(keep_within)
+    return box
 
 
 def choose_next(dropdown: viser.GuiDropdownHandle[str]) -> None:

@@ -1,6 +1,6 @@
 """Numbers typed into boxes, in a real Chromium.
 
-Tests app/ui/parameters.py.
+Tests app/ui/parameters.py, app/ui/widgets.py.
 """
 
 import re
@@ -8,6 +8,7 @@ import re
 import pytest
 from playwright.sync_api import Locator, expect
 
+from app.server.keeping import SetClip
 from app.server.protocol import SetParams, StepFrame
 from tests.browser.conftest import Bench
 
@@ -97,3 +98,15 @@ def test_a_slider_over_decades_shows_its_number_in_the_box_above_alone(bench: Be
     expect(boxes(bench, "gyro noise")).to_have_value("1")
     bench.eventually(lambda: set_params(bench)[-1:] == [{"imu.gyro_noise": 1.0}])
     bench.page.get_by_text("IMU", exact=True).click()
+
+
+def test_a_box_without_a_slider_takes_no_number_beyond_its_limits(bench: Bench) -> None:
+    bench.page.get_by_role("tab", name="View").click()
+    bench.page.get_by_text("Clip and section", exact=True).click()
+    slab = boxes(bench, "slab")
+    for typed, taken in (("-1", "0.05"), ("-2", "0.05"), ("250", "100"), ("0.5", "0.5")):
+        type_over(bench, slab, typed)
+        bench.page.keyboard.press("Enter")
+        expect(slab).to_have_value(taken)
+        bench.eventually(lambda taken=taken: bench.engine.snapshot.clip.slab == float(taken))
+    assert {c.clip.slab for c in bench.engine.sent if isinstance(c, SetClip)} == {0.05, 100.0, 0.5}

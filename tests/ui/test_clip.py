@@ -247,3 +247,9 @@ def test_before_there_is_a_map_nothing_is_clipped_and_that_is_said(server: viser
     with pytest.raises(HemislamError, match="walked path"):
         bench.panel._unroll(True, bench.client)  # type: ignore[arg-type]
     assert bench.now.clip == Clip()
+
+
+@pytest.mark.parametrize("slab", [-1.0, 0.0, float("nan"), 200.0])
+def test_a_slab_that_a_session_could_not_be_opened_with_is_refused(slab: float) -> None:
+    with pytest.raises(HemislamError, match="slab cannot be"):
+        Clip(slab=slab)

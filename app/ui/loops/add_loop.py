@@ -20,7 +20,7 @@ from app.ui.loops.edges import nearest
 from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
 from app.ui.loops.words import NEWER, OLDER
 from app.ui.nodes import add_exact_points, clear
-from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, limited, show
 
 _REST_S: Final = 0.4
 """The guess is tried after the gizmo has rested this long."""
@@ -94,8 +94,8 @@ class AddLoopPanel:
         self._picked: list[int] | None = None
         self._nudging: Nudging | None = None
         gui.add_html(panel("text", "Tell the graph that two keyframes see the same place, whatever the search found."))
-        self._older = gui.add_number("older keyframe", 0, min=0, step=1)
-        self._newer = gui.add_number("newer keyframe", 0, min=0, step=1)
+        self._older = limited(gui.add_number("older keyframe", 0, min=0, step=1))
+        self._newer = limited(gui.add_number("newer keyframe", 0, min=0, step=1))
         self._pick = add_button(gui, _PICK, lambda _: self._toggle_picking(), viser.Icon.POINTER)
         self._register = gui.add_checkbox(
             "register", True, hint="Register the submaps on each other. Off: the guess is used as it is."

@@ -1,0 +1,56 @@
+"""Number boxes keep to their limits, whatever is typed into them.
+
+Tests app/ui/widgets.py.
+"""
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import pytest
+import viser
+
+from app.ui.widgets import by_user, limited
+from tests.ui.conftest import BusyThreads, Wire, browser_sends
+
+APP = Path(__file__).parents[2] / "app"
+
+
+@pytest.mark.parametrize(("typed", "taken"), [(-1, 4), (3, 4), (4, 4), (77, 77), (201, 200)])
+def test_a_number_beyond_the_limits_reaches_no_callback_and_the_box_shows_the_nearest(
+    server: viser.ViserServer, wire: Wire, busy: BusyThreads, typed: int, taken: int
+) -> None:
+    box = limited(server.gui.add_number("neighbours", 20, min=4, max=200, step=1))
+    seen: list[Any] = []
+    box.on_update(by_user(lambda value, _: seen.append(value)))
+    wire.clear()
+    browser_sends(server, box, typed)
+    busy.catch_up()
+    assert seen == [taken] and box.value == taken and isinstance(box.value, int)
+    shown = [message.updates["value"] for message in wire.messages if type(message).__name__ == "GuiUpdateMessage"]
+    assert shown[-1] == taken
+
+
+def test_each_of_three_numbers_has_its_limits_and_one_without_an_end_is_open_there(
+    server: viser.ViserServer, busy: BusyThreads
+) -> None:
+    size = limited(server.gui.add_vector3("size (m)", (1.0, 1.0, 1.0), min=(0.05, 0.05, 0.05), max=(9.0, 9.0, 9.0)))
+    browser_sends(server, size, (0.0, 2.0, 10.0))
+    assert size.value == (0.05, 2.0, 9.0)
+    place = limited(server.gui.add_number("keyframe", 0, min=0))
+    for typed, taken in ((-5, 0), (123_456, 123_456)):
+        browser_sends(server, place, typed)
+        assert place.value == taken
+
+
+def test_every_box_with_limits_keeps_to_them() -> None:
+    found, kept = set(), set()
+    for path in (APP / "ui").rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match call:
+                case ast.Call(func=ast.Attribute(attr="add_number" | "add_vector3"), keywords=options):
+                    if {option.arg for option in options} & {"min", "max"}:
+                        found.add(f"{path.relative_to(APP)}:{call.lineno}")
+                case ast.Call(func=ast.Name(id="limited"), args=[ast.Call() as box]):
+                    kept.add(f"{path.relative_to(APP)}:{box.lineno}")
+    assert len(found) > 10 and found == kept
