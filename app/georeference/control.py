@@ -15,6 +15,7 @@ from app.slam.arrays import F64, Mask
 from app.slam.errors import HemislamError
 from app.slam.metrics import umeyama
 
+_EASTINGS, _DEGREES = ("east", "north", "height"), ("latitude", "longitude", "height")
 CONTROL = ("name", "east", "north", "height", "latitude", "longitude")
 PICKS = ("name", "x", "y", "z")
 """Columns of the two tables."""
@@ -75,31 +76,56 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
     """The grid and (3,) easting, northing, height of each control point by name.
 
     Raises:
-        HemislamError: it lacks columns or the grid.
+        HemislamError: it lacks columns, a name or the grid, or names a point twice.
     """
-    if table.has("name", "east", "north", "height"):
+    columns, names = _coordinates(table), _names(table)
+    if columns == _EASTINGS:
         if not grid:
             raise HemislamError(f"{table.source} holds eastings and northings; say of which grid: EPSG:CODE.")
         crs.projected(grid)
-        numbers = table.numbers("east", "north", "height")
-    elif table.has("name", "latitude", "longitude", "height"):
-        degrees = table.numbers("latitude", "longitude", "height")
+        numbers = table.numbers(*columns)
+    else:
+        degrees = table.numbers(*columns)
         every = Fixes.of(np.arange(len(degrees)), degrees).sound(table.source)
         ground = Ground.of(every, grid)
         grid = ground.centre.crs
         numbers = np.full(degrees.shape, np.nan)
         numbers[every.stamps_ns] = ground.grid
-    else:
-        raise HemislamError(
-            f"{table.source} holds no control points; its first line must name the columns name, E, N, H, or name,"
-            " latitude, longitude, height."
-        )
+    return grid, dict(zip(names, numbers, strict=True))
+
+
+def require_sound(table: NamedColumns) -> None:
+    """Raises HemislamError unless every row is a control point with a name of its own and all coordinates."""
+    columns, _ = _coordinates(table), _names(table)
+    for row, place in enumerate(table.numbers(*columns), 1):
+        for column, number in zip(columns, place.tolist(), strict=True):
+            if not np.isfinite(number):
+                raise HemislamError(
+                    f"{table.source}, row {row}: the {column} is missing; fill it in or remove the row."
+                )
+
+
+def _coordinates(table: NamedColumns) -> tuple[str, str, str]:
+    """The columns of the places. Raises HemislamError: the table lacks them, or any row."""
+    for columns in (_EASTINGS, _DEGREES):
+        if len(table) and table.has("name", *columns):
+            return columns
+    raise HemislamError(
+        f"{table.source} holds no control points; its first line must name the columns name, E, N, H, or name,"
+        " latitude, longitude, height."
+    )
+
+
+def _names(table: NamedColumns) -> list[str]:
+    """Of the control points. Raises HemislamError: one is empty or there twice."""
     names = list(table.columns["name"])
+    if "" in names:
+        raise HemislamError(f"{table.source}, row {names.index('') + 1}: the name is missing; give the point one.")
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise HemislamError(
             f"{table.source} holds control point {twice} more than once; keep one, or rename the other."
         )
-    return grid, dict(zip(names, numbers, strict=True))
+    return names
 
 
 def _refuse_line(points: F64, names: list[str]) -> None:

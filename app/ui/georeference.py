@@ -8,6 +8,7 @@ import numpy as np
 import viser
 
 from app.georeference.align import Alignment
+from app.georeference.control import require_sound
 from app.georeference.ledger import in_rows
 from app.georeference.survey import Pick, Survey
 from app.mapping.kept import Spot
@@ -16,7 +17,7 @@ from app.server.protocol import EditLoop, Georeference, RedoLoop, Snapshot, Undo
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
 from app.ui.files import FileList
-from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
+from app.ui.georeference_maths import centre_of_sphere, control_table, lines_of, names_of, numbers_in, rows_of
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit
 from app.ui.measure import MeasurePanel
@@ -123,8 +124,7 @@ class GeoreferencePanel:
         if len(content) > _MOST_BYTES:
             raise HemislamError(f"A table of control points may have at most {_MOST_BYTES >> 10} kB.")
         text = content.decode("utf-8-sig", errors="replace")
-        if not names_of(text):
-            raise HemislamError("The table names no control points; its first line must be, for example, name,E,N,H.")
+        require_sound(control_table(text))
         self._control = text
         self._show_widgets()
 

@@ -7,7 +7,7 @@ from scipy import optimize
 
 from app.georeference.align import Alignment
 from app.georeference.control import CONTROL
-from app.georeference.tables import table_of
+from app.georeference.tables import NamedColumns, table_of
 from app.mapping.earth import FIX, POINT
 from app.mapping.kept import Spot
 from app.server.protocol import Chunk, Snapshot
@@ -60,11 +60,18 @@ def lines_of(found: Alignment) -> tuple[F32, F32]:
     return measured.astype(np.float32), np.stack((measured, at), axis=1).astype(np.float32)
 
 
+def control_table(text: str) -> NamedColumns:
+    """A table of control points. Raises HemislamError: it has no heading, or a row is cut."""
+    return table_of(text.splitlines(), "The table of control points", *CONTROL)
+
+
 def names_of(text: str) -> tuple[str, ...]:
-    """Of the control points in a table. Raises HemislamError: it has no heading, or a row is cut."""
-    if not text.strip():
-        return ()
-    return tuple(table_of(text.splitlines(), "The table of control points", *CONTROL).columns.get("name", ()))
+    """Of the control points in a table, each once: the page goes blank if a dropdown offers one twice.
+
+    Raises:
+        HemislamError: it has no heading, or a row is cut.
+    """
+    return tuple(dict.fromkeys(control_table(text).columns.get("name", ()))) if text.strip() else ()
 
 
 def numbers_in(text: str, what: str, count: int) -> list[float]:

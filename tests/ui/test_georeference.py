@@ -221,7 +221,29 @@ def test_a_measured_point_has_its_coordinates_on_earth_too() -> None:
 
 def test_a_table_that_names_no_points_is_refused(paging: Paging) -> None:
     assert names_of(TABLE) == ("P1", "P2", "P3") and names_of("a,b\n1,2\n") == ()
-    for text, why in ((b"a,b\n1,2\n", "names no control points"), (b"x" * 70_000, "at most 64 kB")):
+    for text, why in ((b"a,b\n1,2\n", "holds no control points"), (b"x" * 70_000, "at most 64 kB")):
         with pytest.raises(HemislamError, match=why):
             paging.panel._uploaded(text)
     assert paging.panel._control == ""
+
+
+@pytest.mark.parametrize(
+    ("row", "why"),
+    [
+        ("P1,691520,5334700,520", "holds control point P1 more than once"),
+        (",691520,5334700,520", "row 4: the name is missing"),
+        ("P4,abc,5334700,520", r"row 4: `abc` is not a number \(east\)"),
+        ("P4,691520,,520", "row 4: the north is missing"),
+        ("P4,691520,5334700,nan", "row 4: the height is missing"),
+        ("P4,691520", "row 4 has 2 columns"),
+    ],
+)
+def test_a_row_that_is_no_control_point_is_named_when_the_table_is_loaded(paging: Paging, row: str, why: str) -> None:
+    with pytest.raises(HemislamError, match=why):
+        paging.panel._uploaded(f"{TABLE}{row}\n".encode())
+    assert paging.panel._control == ""
+
+
+def test_a_session_that_names_a_point_twice_does_not_offer_it_twice(paging: Paging) -> None:
+    paging.show(Snapshot(earth=Earth(Survey(control=f"{TABLE}P1,691520,5334700,520\n"))))
+    assert paging.panel._name.options == ("P1", "P2", "P3")
