@@ -104,7 +104,7 @@ class ClipPanel:
             self._show(clip)
         if self._first is not None and not self._measure.picking:
             self._first = None
-        cutting = self._measure.picking and self._measure.taker == self._picked
+        cutting = self._measure.taker == self._picked
         self._asked.visible = cutting
         self._asked.content = panel("note", f"Click the {'first' if self._first is None else 'other'} end on the map.")
         box = None if clip.unrolled else clip.hiding

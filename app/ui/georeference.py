@@ -27,6 +27,7 @@ from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, lim
 
 NOTHING, RECORDED, FILE, CONTROL = "nothing", "fixes of the recording", "fixes of a file", "control points"
 _ALIGN, _FACTORS = "align only", "as factors"
+_PICK: Final = "Pick it on the map"
 _POINT, _SPHERE = "a point", "a sphere's centre"
 _FIXES: Final = (".csv", ".txt", ".nmea", ".log", ".ubx")
 _MOST_BYTES: Final = 64 << 10
@@ -79,7 +80,7 @@ class GeoreferencePanel:
         self._name = gui.add_dropdown("control point", ("–",))
         self._fit = gui.add_dropdown("pick", (_POINT, _SPHERE), hint="By a click on the map.")
         self._radius = limited(gui.add_number("sphere's radius (m)", 0.0725, min=0.01, max=1.0, step=0.0005))
-        self._pick = add_button(gui, "Pick it on the map", lambda _: self._begin_pick(), viser.Icon.MAP_PIN, color=None)
+        self._pick = add_button(gui, _PICK, lambda _: measure.pick(self._picked), viser.Icon.MAP_PIN, color=None)
         self._bridge = Bridge(gui, "georeference", self._act)
         self._html = gui.add_html("")
         self._by.on_update(by_user(lambda _, __: self._show_widgets()))
@@ -157,13 +158,8 @@ class GeoreferencePanel:
             self._name.options = names
 
     # --- picking ---------------------------------------------------------------------------------
-    def _begin_pick(self) -> None:
-        self._measure.pick(self._picked)
-        self._pick.label = f"Click {self._name.value} on the map …"
-
     def _picked(self, spot: Spot, current: Snapshot) -> None:
         """A click met the map: the point itself, or the centre of the sphere there, is the chosen control point."""
-        self._pick.label = "Pick it on the map"
         poses, at, name = current.keyframe_poses, spot.at, self._name.value
         try:
             if self._fit.value == _SPHERE:
@@ -189,6 +185,8 @@ class GeoreferencePanel:
             new = opened != self._open and recording is not None and recording.fixes
             self._open = opened
             self._show(earth.survey, RECORDED if new else NOTHING)
+        picking = self._measure.taker == self._picked
+        self._pick.label = f"Click {self._name.value} on the map …" if picking else _PICK
         edits = (current.loops.undo, current.loops.redo)
         if self._changes(earth, *edits, current.session):
             self._html.content = self._bridge.live(_result(current)) if earth.survey is not None else ""

@@ -38,7 +38,7 @@ class MeasurePanel:
         self._page = page
         self._changes = Changes()
         self._kind = STOP
-        self.taker: Callable[[Spot, Snapshot], None] | None = None  # of a spot that is picked, not measured
+        self.taker: Callable[[Spot, Snapshot], None] | None = None  # of a spot that is being picked, not measured
         self._where: GeoReference | None = None
         self._click: tuple[F64, F64, float] | None = None  # of the newest click: its ray in the map, and its width
         self._spots: tuple[Spot, ...] = ()  # of the measure that is begun
@@ -62,14 +62,14 @@ class MeasurePanel:
         """Whether clicks in the scene are for a measure."""
         return self._kind != STOP
 
-    def begin(self, kind: str) -> None:
+    def begin(self, kind: str, taker: Callable[[Spot, Snapshot], None] | None = None) -> None:
         load()
+        self.taker = taker
         self._kind, self._spots = kind, ()
 
     def pick(self, taker: Callable[[Spot, Snapshot], None]) -> None:
         """Give `taker` the spot that the next click meets, instead of measuring it."""
-        self.begin(PICK)
-        self.taker = taker
+        self.begin(PICK, taker)
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Take the newest click, and show what the session keeps."""
@@ -102,9 +102,11 @@ class MeasurePanel:
             self._draw_list(later)
 
     def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
-        if kind == PICK and self.taker is not None:
+        if kind == PICK:
+            taker = self.taker
             self.begin(STOP)
-            self.taker(spot, current)
+            if taker is not None:
+                taker(spot, current)
             return
         self._spots = (*self._spots, spot)
         if len(self._spots) == _SPOTS[kind]:

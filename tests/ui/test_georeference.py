@@ -30,7 +30,7 @@ from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
 from app.ui.georeference import CONTROL, FILE, NOTHING, RECORDED, GeoreferencePanel
 from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
-from app.ui.measure import MeasurePanel
+from app.ui.measure import STOP, MeasurePanel
 from app.ui.measure_maths import as_csv, numbers, words
 from app.ui.widgets import View
 from tests.ui.conftest import Wire, page_of, user_clicks, user_sets
@@ -184,6 +184,19 @@ def test_points_are_picked_one_after_the_other_by_clicks_on_the_map(paging: Pagi
     panel._act("drop P1", None)  # type: ignore[arg-type]
     (command,) = paging.sent
     assert isinstance(command, Georeference) and [pick.name for pick in command.survey.picks] == ["P2"]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("instead", [STOP, "distance"])
+def test_the_button_asks_for_a_click_only_while_a_point_is_picked(paging: Paging, instead: str) -> None:
+    earth = replace(paging.now, earth=Earth(Survey(control=TABLE, crs="EPSG:32632")))
+    paging.show(earth)
+    button, usual = paging.panel._pick, paging.panel._pick.label
+    user_clicks(button)
+    paging.show(earth)
+    assert button.label == "Click P1 on the map …"
+    paging.measure.begin(instead)
+    paging.show(earth)
+    assert button.label == usual == "Pick it on the map"
 
 
 def sphere(centre: np.ndarray, radius: float, points: int = 400) -> Chunk:
