@@ -64,6 +64,7 @@ class ClipPanel:
             )
             self._size = limited(gui.add_vector3("size (m)", (1.0,) * 3, min=(0.05,) * 3, max=(_FAR_M,) * 3, step=0.05))
             self._turn = limited(gui.add_number("turn (°)", 0.0, min=-360.0, max=360.0, step=1.0))
+            self._turn.precision = 2  # viser would take it from the step, and cut 12.5 to 12
             self._pull = gui.add_checkbox("handles", True, hint="Arrows move the sides, the one in the middle the box.")
             add_button(gui, "Look from its front", self.look, viser.Icon.VIEWPORT_NARROW)
             save = viser.Icon.DEVICE_FLOPPY

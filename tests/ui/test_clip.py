@@ -249,6 +249,12 @@ def test_before_there_is_a_map_nothing_is_clipped_and_that_is_said(server: viser
     assert bench.now.clip == Clip()
 
 
+def test_boxes_take_all_the_decimals_that_they_show(server: viser.ViserServer) -> None:
+    panel = Bench(server).panel
+    assert panel._turn.precision == 2
+    assert min(panel._slab.precision, panel._middle.precision, panel._size.precision) >= 2
+
+
 @pytest.mark.parametrize("slab", [-1.0, 0.0, float("nan"), 200.0])
 def test_a_slab_that_a_session_could_not_be_opened_with_is_refused(slab: float) -> None:
     with pytest.raises(HemislamError, match="slab cannot be"):
