@@ -11,7 +11,7 @@ HINTS: Final[dict[str, str]] = {
     "iterations": "Updates of the filter until the pose no longer changed.",
     "residual": "Distance of points to the planes they are matched with, RMS in mm.",
     "inliers": "Points that found a plane in the map, in percent of those used.",
-    "degeneracy": "Whether the scan leaves a direction open, by the least eigenvalue of its information.",
+    "degeneracy": "How uncertain the scan alone leaves the direction that it constrains least, in cm (1 σ).",
     "velocity": "Speed of the IMU in m/s, and its parts along x, y and z of the odometry frame.",
     "distance": "Length of the trajectory so far, in m.",
     "gyroscope bias": "Estimated constant error of the gyroscope in mrad/s, and its parts.",

@@ -9,6 +9,7 @@ from app.server.protocol import Snapshot
 from app.slam.types import F64, I64, STAGES, StepResult
 from app.ui.colours import Rgb
 from app.ui.html import BAD, GOOD, WARN, Tile, css, heading, number, panel
+from app.ui.timeline import OPEN, OPEN_CM, uncertainty_cm
 from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, chart
 
 HISTORY: Final = 300
@@ -41,15 +42,14 @@ def ground_tiles(result: StepResult, limit: float) -> list[Tile]:
 def filter_tiles(result: StepResult) -> list[Tile]:
     update = result.registration
     share = update.inliers / update.used if update.used else np.nan
-    smallest = float(update.eigenvalues[0]) if len(update.eigenvalues) else np.nan
-    information = f"least information {smallest:.3g}" if np.isfinite(smallest) else ""
+    uncertainty = float(uncertainty_cm(update.eigenvalues[0])) if len(update.eigenvalues) else np.nan
+    degeneracy = (OPEN, "") if uncertainty >= OPEN_CM else (number(uncertainty, 1), "cm")
     converged = ("", "") if update.converged else ("not conv.", WARN)
-    degenerate = ("degenerate", WARN) if update.degenerate else ("none", "")
     return [
         Tile("iterations", str(update.iterations), converged[0], colour=converged[1]),
         Tile("residual", number(1000 * update.residual_rms, 1), "mm"),
         Tile("inliers", number(100 * share, 0), f"% of {update.used:,}"),
-        Tile("degeneracy", degenerate[0], information, update.reason, degenerate[1], "wide"),
+        Tile("degeneracy", *degeneracy, update.reason, WARN if update.degenerate else "", "wide"),
     ]
 
 

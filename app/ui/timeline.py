@@ -21,6 +21,8 @@ from app.ui.widgets import Changes, Page
 _PERIOD_S: Final = 0.5
 COLUMNS: Final = 480
 """Most columns that a recording is thinned to, however long."""
+OPEN_CM, OPEN = 1e3, "> 10 m"
+"""A direction that is more uncertain than this is open: how uncertain says nothing more."""
 DEGENERATE_CM: Final = 10.0
 """A direction more uncertain than this is called degenerate (`app.slam.iekf.DEGENERATE_SIGMA`)."""
 _NOTES: Final = 50
@@ -37,6 +39,7 @@ class Strip:
         name, unit, hint: for people. digits: after the point. colour: CSS.
         least: the scale ends here at least. value: (n,) in the strip's unit, nan where there is none.
         limit: from where on a value is bad. worse: which way is bad. bars: single events, not a curve.
+        most: from where on words stand for a value, and which.
     """
 
     key: str
@@ -50,15 +53,17 @@ class Strip:
     limit: Callable[[Snapshot], float] | None = None
     worse: Literal["high", "low"] = "high"
     bars: bool = False
+    most: tuple[float, str] | None = None
 
 
 def _inliers(series: Series) -> F64:
     return 100 * series["inliers"] / np.where(series["used"] > 0, series["used"], np.nan)
 
 
-def _uncertainty(series: Series) -> F64:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(100 / np.sqrt(series["degeneracy"]))
+def uncertainty_cm(degeneracy: F64) -> F64:
+    """Of the direction that a scan constrains least, 1 σ; at most `OPEN_CM`."""
+    with np.errstate(divide="ignore"):
+        return np.minimum(100 / np.sqrt(np.maximum(degeneracy, 0.0)), OPEN_CM)
 
 
 def _period_ms(snapshot: Snapshot) -> float:
@@ -73,7 +78,7 @@ STRIPS: Final = (
           _inliers, worse="low"),
     Strip("uncertain", "degeneracy", "cm", 1, "#ce70dc", 6.0,
           "How uncertain this scan alone leaves the direction it constrains least; over 10 cm is degenerate.",
-          _uncertainty, lambda _: DEGENERATE_CM),
+          lambda s: uncertainty_cm(s["degeneracy"]), lambda _: DEGENERATE_CM, most=(OPEN_CM, OPEN)),
     Strip("ground", "ground", "%", 0, "#34c7aa", 100.0, "Points labelled ground. Red: no plane was found.",
           lambda s: 1e2 * s["ground_share"], lambda _: 1e-9, worse="low"),
     Strip("gap", "IMU gap", "ms", 0, "#98cd5a", 20.0, "Longest time between the IMU samples of the frame.",
@@ -186,7 +191,7 @@ def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
         usual = float(np.percentile(finite, 98)) if len(finite) else 0.0
         strips.append(
             {
-                **{name: getattr(strip, name) for name in ("name", "unit", "digits", "colour", "hint", "bars")},
+                **{name: getattr(strip, name) for name in ("name", "unit", "digits", "colour", "hint", "bars", "most")},
                 "low": strip.worse == "low",
                 "top": strip.least if strip.worse == "low" else max(strip.least, 1.2 * usual),
                 "limit": bad.get(strip.key),

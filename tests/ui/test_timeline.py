@@ -93,6 +93,13 @@ def test_units_are_those_on_the_label() -> None:
     ]  # fmt: skip
 
 
+def test_a_direction_that_is_open_is_called_so_instead_of_a_number_of_many_digits() -> None:
+    one = snapshot(4, 4, degeneracy=np.array([1 / 0.04**2, 2.7e-13, 0.0, np.nan]))
+    np.testing.assert_allclose(seen(one).columns().high["uncertain"], [4.0, 1000.0, 1000.0, np.nan])
+    (strip,) = (strip for strip in message(seen(one), one)["strips"] if strip["name"] == "degeneracy")
+    assert strip["most"] == (1000.0, "> 10 m") and strip["top"] <= 1200
+
+
 def test_what_the_page_calls_degenerate_is_what_the_filter_does() -> None:
     assert DEGENERATE_CM == 100 * iekf.DEGENERATE_SIGMA
 

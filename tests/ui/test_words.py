@@ -25,9 +25,9 @@ from app.ui import hints
 from app.ui.colours import LABEL, Limits, legend
 from app.ui.files import _FORMATS, result_folder_name, size_text
 from app.ui.hints import HINTS
-from app.ui.html import BAD, GOOD, Tile, panel, source
+from app.ui.html import BAD, GOOD, WARN, Tile, panel, source
 from app.ui.loops.words import KINDS, LoopKind
-from app.ui.readouts import HISTORY, plotted, stacked_stages
+from app.ui.readouts import HISTORY, filter_tiles, plotted, stacked_stages
 from app.ui.status import findings_html, log_html, settled, title, verdicts
 from app.ui.transport import where
 from tests.ui.fake_engine import FINDINGS, FakeEngine
@@ -152,3 +152,14 @@ def test_verdicts_are_readable_also_in_a_row_that_is_chosen(sheet: str, backgrou
     chosen = 0.35 * np.array([38.0, 166.0, 154.0]) + 0.65 * background
     dark, light = sorted((luminance(colour), luminance(chosen)))
     assert (light + 0.05) / (dark + 0.05) >= 4.5
+
+
+@pytest.mark.parametrize(
+    ("information", "words"),
+    [((1 / 0.04**2,), ("4.0", "cm", "")), ((2.7e-13,), ("> 10 m", "", WARN)), ((), ("–", "cm", WARN))],
+)
+def test_degeneracy_is_said_as_the_diagnostics_say_it(information: tuple[float, ...], words: tuple[str, ...]) -> None:
+    result = FakeEngine(columns=8).result(20, Params())
+    update = replace(result.registration, eigenvalues=np.array(information), degenerate=bool(words[2]))
+    (tile,) = (tile for tile in filter_tiles(replace(result, registration=update)) if tile.name == "degeneracy")
+    assert (tile.value, tile.unit, tile.colour) == words

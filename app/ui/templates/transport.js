@@ -88,7 +88,7 @@ function draw() {
     }
     const v = s.data[s.low ? at : C + at], mid = top + ROW / 2 - 1;
     say(s.name, 8, mid, QUIET);
-    say(isNaN(v) ? '–' : `${v.toFixed(s.digits)} ${s.unit}`, W - 8, mid, beyond(s, v) ? BAD : TEXT, 'right');
+    say(isNaN(v) ? '–' : s.most && v >= s.most[0] ? s.most[1] : `${v.toFixed(s.digits)} ${s.unit}`, W - 8, mid, beyond(s, v) ? BAD : TEXT, 'right');
   });
   const top = HEAD + ROW * d.strips.length, mid = top + ROW / 2 - 1, counts = [];
   pen.fillStyle = 'rgba(127,140,160,.09)';
