@@ -26,3 +26,9 @@ class Finding:
         """Text and option, as one line."""
         use = self.option if self.verdict == "needs you" else f"(if that is wrong: {self.option})"
         return f"{self.text} {use}" if self.option else self.text
+
+    @property
+    def sentence(self) -> str:
+        """For a notification on the page, which has the options under Recording."""
+        said = f"{self.subject[:1].upper()}{self.subject[1:]}: {self.text.rstrip('.')}."
+        return f"{said} Settle it under Recording." if self.option else said

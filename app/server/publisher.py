@@ -157,7 +157,7 @@ class Publisher:
         if session.frame < 0:
             for finding in session.findings:
                 if finding.verdict == "needs you":
-                    self.notice("warning", str(finding))
+                    self.notice("warning", finding.sentence)
 
     def show(self, *, urgent: bool = True, **changes: Any) -> None:
         """Change fields of the transport."""

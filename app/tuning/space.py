@@ -77,10 +77,10 @@ def parse_dimensions(text: str) -> tuple[Dimension, ...]:
         if path not in known:
             Params().with_values({path: 0})  # raises, and names the parameters that are meant
         if path in found:
-            raise HemislamError(f"--parameters names {path} twice.")
+            raise HemislamError(f"{path} is named twice; name it once.")
         found[path] = _dimension(known[path], limits if equals else None)
     if not found:
-        raise HemislamError("--parameters names nothing that varies; write --parameters ground.alpha,ground.sigma.")
+        raise HemislamError("Nothing is named that varies; name parameters as in ground.alpha,ground.sigma.")
     return tuple(found.values())
 
 
@@ -111,8 +111,8 @@ def grid(dimensions: Sequence[Dimension], most: int) -> list[Mapping[str, Any]]:
     least = math.prod(len(dimension.grid(2)) for dimension in dimensions)
     if least > most:
         raise HemislamError(
-            f"A grid over {len(dimensions)} parameters has at least {least} points, more than --trials {most};"
-            " use --search bayes or random, or fewer parameters."
+            f"A grid over {len(dimensions)} parameters has at least {least} points, more than {most} trials;"
+            " search by bayes or random, or vary fewer parameters."
         )
     points, settings = 2, _grid(dimensions, 2)
     while len(finer := _grid(dimensions, points + 1)) <= most and points < most:

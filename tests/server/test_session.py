@@ -34,7 +34,7 @@ def test_an_opened_recording_shows_its_first_frame_and_what_needs_the_user() -> 
     assert snapshot.transport.frame == 0 and not snapshot.transport.playing
     assert snapshot.result is not None and snapshot.result.index == 0
     assert snapshot.progress is None
-    assert [n.text for n in snapshot.notices] == ["The unit is unclear. --set recording.acceleration_unit=g"]
+    assert [n.text for n in snapshot.notices] == ["IMU units: The unit is unclear. Settle it under Recording."]
 
 
 @pytest.mark.parametrize(("speed", "frames"), [(1.0, 10), (0.5, 5), (5.0, 50)])
