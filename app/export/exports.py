@@ -176,12 +176,12 @@ def prepare_folder(folder: Path, *, replace: bool = False) -> None:
     Raises:
         HemislamError: the folder holds results and `replace` is not set, or it is not writable.
     """
+    make_folder(folder)
     held = [export.name for export in BY_RUN if (folder / export.name).exists()]
     if held and not replace:
         raise HemislamError(
             f"{folder} already holds results ({', '.join(held)}); choose another folder or add --force."
         )
-    make_folder(folder)
     if not os.access(folder, os.W_OK | os.X_OK):
         raise HemislamError(f"The folder {folder} is not writable; choose another one.")
 

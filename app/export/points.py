@@ -39,7 +39,9 @@ class Choice:
 
     def __post_init__(self) -> None:
         if not (self.thin == 0 or 0.001 <= self.thin <= 100):
-            raise HemislamError(f"Voxels of {self.thin:g} m do not thin a map; choose 0.001 to 100 m.")
+            raise HemislamError(
+                f"Voxels of {self.thin:g} m do not thin a map; choose 0.001 to 100 m, or 0 for all points."
+            )
         if not 0.01 <= self.slab <= 100:
             raise HemislamError(f"A slab of {self.slab:g} m shows no profile; choose 0.01 to 100 m.")
 

@@ -143,7 +143,9 @@ def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
     if not same_recording(a, b):
         return "A has opened another recording; B stays where it is.", WARN
     behind = a.transport.frame - b.transport.frame
-    trouble = next((notice.text for notice in reversed(b.notices) if notice.level == "error"), "")
+    unsaved = {saved.error for saved in b.saved}  # a save that failed is no trouble of B's
+    errors = [one.text for one in b.notices if one.level == "error" and one.text not in unsaved]
+    trouble = errors[-1] if errors else ""
     if abs(behind) > 1:
         return f"B is {abs(behind):,} frames {'behind' if behind > 0 else 'ahead'}. {trouble}".strip(), WARN
     return (f"B: {trouble}", BAD) if trouble else ("", "")

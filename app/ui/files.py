@@ -23,6 +23,8 @@ from app.ui.widgets import Changes, Page, add_button, by_user, dialog, limited
 
 _MOST_ENTRIES: Final = 60
 _RECENT: Final = 3
+_LONGEST_NAME: Final = 200
+"""Bytes; file systems take 255."""
 _OF_A_RUN: Final = "all of a run"
 
 
@@ -53,6 +55,16 @@ def result_folder_name(recording: Path, now: datetime) -> str:
     """`hall_bpearl-2026-05-01-134502`: sorts by recording, then by time; never overwrites an older run."""
     stem = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in recording.stem)
     return f"{stem}-{now:%Y-%m-%d-%H%M%S}"
+
+
+def folder_name(typed: str) -> str:
+    """What was typed as the name of a folder for results. Raises HemislamError: it cannot be one."""
+    name = typed.strip()
+    if not name or Path(name).name != name or name.startswith(".") or not name.isprintable():
+        raise HemislamError("The folder needs a name without / that does not begin with a dot.")
+    if len(name.encode()) > _LONGEST_NAME:
+        raise HemislamError("The name is too long for a folder; shorten it.")
+    return name
 
 
 class RecentPanel:
@@ -239,18 +251,14 @@ class FilesPanel:
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
 
         def confirmed(_: object) -> None:
-            chosen = Path(name.value.strip())
-            if not name.value.strip() or chosen.name != str(chosen) or chosen.name in (".", ".."):
-                problem.content = panel("text", "The folder needs a name without /.")
-                problem.visible = True
-                return
             formats = (_FORMATS[files.value],) if files.value in _FORMATS else ()
             try:
+                folder = self._results / folder_name(name.value)
                 choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
             except HemislamError as error:
                 problem.content, problem.visible = panel("text", str(error)), True
                 return
-            self._page.send(Save(self._results / chosen, formats, choice))
+            self._page.send(Save(folder, formats, choice))
             close()
 
         save.on_click(confirmed)

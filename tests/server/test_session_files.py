@@ -195,14 +195,15 @@ def test_a_save_that_waits_does_not_show_how_far_the_last_one_was(tmp_path: Path
     may_go_on.set()
 
 
-def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "why"), [("file", "File exists"), ("n" * 300, "File name too long")])
+def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path, name: str, why: str) -> None:
     (tmp_path / "file").write_text("in the way")
     bench = Bench()
-    bench.controller.handle(Save(tmp_path / "file"))
+    bench.controller.handle(Save(tmp_path / name))
     while not bench.see().saved:
         bench.controller.work()
-    assert str(tmp_path / "file") in bench.see().saved[0].error
-    assert str(tmp_path / "file") in last_notice(bench.see())
+    assert f"The folder {tmp_path / name} cannot be made: {why};" in bench.see().saved[0].error
+    assert str(tmp_path / name) in last_notice(bench.see())
 
 
 def test_a_walk_is_compared_with_another_trajectory_without_being_walked_again(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from app.server.folders import Folders
 from app.server.fork import Workspace
-from app.server.protocol import Notice, Progress, Seek, SetParams, StepFrame
+from app.server.protocol import Notice, Progress, Saved, Seek, SetParams, StepFrame
 from app.slam.types import GROUND, NON_GROUND, SEED, Cloud
 from app.ui.compare_maths import (
     A_COLOUR,
@@ -288,7 +288,9 @@ def test_the_page_says_how_b_is_doing(page: Page) -> None:
     assert how(a, replace(a, progress=Progress("Going to frame 20", 0.5)))[0] == "Going to frame 20 · 50 %"
     assert "starting" in how(a, replace(a, recording=None))[0]
     assert "another recording" in how(replace(a, recording=replace(recording, path=Path("/x.mcap"))), a)[0]
-    assert "it broke" in how(a, replace(a, notices=(Notice(1, "error", "it broke"),)))[0]
+    broken = replace(a, notices=(Notice(1, "error", "it broke"), Notice(2, "error", "disk full")))
+    assert "disk full" in how(a, broken)[0]
+    assert how(a, replace(broken, saved=(Saved(Path("out"), "disk full"),)))[0] == "B: it broke"
 
 
 def test_a_page_with_a_fork_at_rest_sends_nothing(page: Page, wire: Wire) -> None:

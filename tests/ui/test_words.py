@@ -20,10 +20,11 @@ from app.server.protocol import (
     StepFrame,
     Transport,
 )
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.ui import hints
 from app.ui.colours import LABEL, Limits, legend
-from app.ui.files import _FORMATS, result_folder_name, size_text
+from app.ui.files import _FORMATS, folder_name, result_folder_name, size_text
 from app.ui.hints import HINTS
 from app.ui.html import BAD, GOOD, WARN, Tile, panel, source
 from app.ui.loops.words import KINDS, LoopKind
@@ -89,6 +90,13 @@ def test_the_legend_shows_chosen_ends_where_they_lie_among_all_values() -> None:
     text = legend("height", Limits(-2.0, 3.0), Limits(-1.0, 2.0))
     assert ">-1<" in text and ">2<" in text
     assert 'value="20"' in text and 'value="80"' in text
+
+
+@pytest.mark.parametrize("typed", ["", "  ", ".", "..", ".hidden", "a/b", "/tmp", "a\0b", "n" * 300, "ü" * 150])
+def test_a_name_that_is_none_for_a_folder_is_refused(typed: str) -> None:
+    with pytest.raises(HemislamError, match=r"needs a name|too long"):
+        folder_name(typed)
+    assert folder_name(" hall 2.5 ") == "hall 2.5"
 
 
 def test_result_folders_sort_and_need_no_quoting() -> None:
