@@ -8,11 +8,12 @@ import viser
 from app.mapping.kept import Note
 from app.server.keeping import AddNote, EditNote
 from app.server.protocol import Seek, Snapshot
+from app.slam.errors import HemislamError
 from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.nodes import add_exact_points, clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, dialog
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, dialog
 
 _SHOWN_NOTES: Final = 30
 _PINNED: Final = 100
@@ -47,6 +48,8 @@ class NotesPanel:
 
     def _note(self) -> None:
         if self._text.value.strip():
+            if self._page.snapshot().recording is None:
+                raise HemislamError("No recording is open that the note could be kept with; open one first.")
             self._page.send(AddNote(self._text.value))
             self._text.value = ""  # type: ignore[misc]  # mypy overlooks viser's setter
 
@@ -66,11 +69,13 @@ class NotesPanel:
             text = client.gui.add_text("note", before)
             keep = client.gui.add_button("Keep", icon=viser.Icon.CHECK)
 
-        def kept(_: object) -> None:
+        def kept(_: object, __: viser.ClientHandle) -> None:
+            if not text.value.strip():
+                raise HemislamError("The note is empty; write something, or cancel and delete it by ✕ in the list.")
             self._page.send(EditNote(place, before, text.value))
             close()
 
-        keep.on_click(kept)
+        keep.on_click(by_user(kept))
 
     # --- pins ------------------------------------------------------------------------------------
     def _draw_pins(self, snapshot: Snapshot, view: View) -> None:

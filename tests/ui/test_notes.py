@@ -1,6 +1,7 @@
 """Notes: a remark becomes a command, what the session keeps is listed and pinned, and none of it is taken for html."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,8 @@ import viser
 
 from app.mapping.kept import Note
 from app.server.keeping import AddNote, EditNote
-from app.server.protocol import Command, Seek, Snapshot
+from app.server.protocol import Command, OpenedRecording, Seek, Snapshot
+from app.slam.errors import HemislamError
 from app.ui.notes import _SHOWN_NOTES, NotesPanel
 from app.ui.widgets import View
 from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
@@ -22,7 +24,7 @@ class Notes:
     def __init__(self, server: viser.ViserServer) -> None:
         self.sent: list[Command] = []
         self.panel = NotesPanel(page_of(server, self.sent.append, lambda: self.snapshot))
-        self.snapshot = Snapshot()
+        self.snapshot = Snapshot(recording=OpenedRecording(Path("walk.mcap"), 0, 60.0, 600, ()))
 
     def write(self, text: str) -> None:
         user_sets(self.panel._text, text)
@@ -106,6 +108,47 @@ def test_nothing_is_sent_to_the_page_while_no_note_is_added(notes: Notes, wire: 
     assert wire.messages == []
     notes.show(Note(3, "here"), Note(4, "and there"))
     assert wire.messages
+
+
+class Browser:
+    """One that was asked for a text in a dialog; what it is told."""
+
+    def __init__(self, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.gui, self.told, self.added = server.gui, list[str](), dict[str, Any]()
+        for kind in ("add_text", "add_button"):
+            monkeypatch.setattr(server.gui, kind, self._noting(getattr(server.gui, kind)))
+
+    def _noting(self, add: Any) -> Any:
+        return lambda label, *args, **options: self.added.setdefault(label, add(label, *args, **options))
+
+    def add_notification(self, _title: str, text: str, **_: Any) -> None:
+        self.told.append(text)
+
+    def clicks(self, button: str) -> None:
+        for callback in self.added[button]._impl.update_cb:
+            callback(viser.GuiEvent(client=self, client_id=0, target=self.added[button]))  # type: ignore[arg-type]
+
+
+def test_an_emptied_note_is_not_deleted_without_a_word(
+    server: viser.ViserServer, notes: Notes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes.show(Note(70, "a turn"))
+    browser = Browser(server, monkeypatch)
+    notes.panel._act("edit 0", browser)  # type: ignore[arg-type]
+    user_sets(browser.added["note"], " ")
+    browser.clicks("Keep")
+    assert notes.sent == [] and "The note is empty" in browser.told[0]
+    user_sets(browser.added["note"], "a left turn")
+    browser.clicks("Keep")
+    assert notes.sent == [EditNote(0, "a turn", "a left turn")] and len(browser.told) == 1
+
+
+def test_a_note_without_a_recording_is_refused_and_stays_in_its_field(notes: Notes) -> None:
+    notes.snapshot = Snapshot()
+    user_sets(notes.panel._text, "the door opens")
+    with pytest.raises(HemislamError, match="No recording is open"):
+        notes.panel._note()
+    assert notes.sent == [] and notes.panel._text.value == "the door opens"
 
 
 # --- pins ----------------------------------------------------------------------------------------
