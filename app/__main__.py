@@ -118,22 +118,25 @@ def info(
       hemislam info walk.mcap
       hemislam info indoor1.bag --preset h2lid
     """
-    from app.calibration.calibrate import is_mounting_unknown
-    from app.cli.run import look_for_mounting
+    from app.cli.run import settle_mounting
     from app.sensors.doctor import DAMAGE, examine
+    from app.sensors.findings import Finding, FindingVerdict
 
     params = params_for(recording)
     options.say_calibrated(recording)
     with options.progress_bar("Reading") as show:
         findings = examine(recording, params, progress=show)
+    settled, advised = settle_mounting(recording, params) if calibrate else (params, "")
+    if advised:
+        verdict: FindingVerdict = "needs you" if settled == params else "corrected"
+        told = Finding("mount", verdict, advised)
+        findings = tuple(told if finding.subject == told.subject else finding for finding in findings)
     width = max((len(finding.subject) for finding in findings), default=0)
     for finding in findings:
         typer.echo(f"{finding.verdict:<9}  {finding.subject:<{width}}  {finding.text}")
         if finding.option:
             use = "->" if finding.verdict == "needs you" else "if that is wrong:"
             typer.echo(f"{'':<9}  {'':<{width}}  {use} {finding.option}")
-    if calibrate and is_mounting_unknown(params) and (advised := look_for_mounting(recording, params)):
-        typer.echo(advised)
     waiting = sum(finding.verdict == "needs you" for finding in findings)
     typer.echo(
         f"{waiting} of {len(findings)} findings need your attention." if waiting else "Nothing needs your attention."

@@ -77,6 +77,8 @@ def run(
     say_calibrated(recording)
     edits = edit_files.read(read_text(loops, "save edits of loops in the workbench"), str(loops)) if loops else ()
     params, advised = settle_mounting(recording, params) if calibrate else (params, "")
+    if advised:
+        typer.echo(advised)
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
     session = open_session(recording, params, start, duration, truth=truth_path, read_ahead=True)
@@ -118,20 +120,14 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
     found = _contradicted(recording, params, "Estimating the pose of the LiDAR on the IMU")
     if isinstance(found, str):
         return params, found
-    advised = f"{found.contradiction()}; this was found in the recording and is used. To save it: {_saving(recording)}"
-    typer.echo(advised)
+    advised = f"{found.contradiction()}; `run` and `serve` use this. To save it: {_saving(recording)}"
     return params.with_values(found.found()), advised
 
 
 def look_for_mounting(recording: Path, params: "Params") -> str:
     """What the recording shows about its mounting if the parameters differ, in a sentence; "" if nothing."""
-    from app.calibration.calibrate import is_mounting_unknown
-
     found = _contradicted(recording, params, "Looking for the cause")
-    if isinstance(found, str):
-        return found
-    used = "; `run` and `serve` use this. To save it" if is_mounting_unknown(params) else ""
-    return f"{found.contradiction()}{used}: {_saving(recording)}"
+    return found if isinstance(found, str) else f"{found.contradiction()}: {_saving(recording)}"
 
 
 def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration | str":

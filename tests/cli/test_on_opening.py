@@ -56,3 +56,4 @@ def test_info_shows_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.Monk
     told = CliRunner().invoke(cli, ["info", str(walk)]).output
     assert "rotated by 70°, -50°, 104° on the IMU, and the IMU's clock" in told
     assert f"`run` and `serve` use this. To save it: hemislam calibrate {walk} --write" in told
+    assert told.count("mount ") == 1 and "no pose of the LiDAR on the IMU is given" not in told, "it is said once"
