@@ -163,6 +163,14 @@ def test_the_bar_stays_and_works_while_the_panel_is_closed(bench: Bench) -> None
     bench.eventually(lambda: scene.bounding_box() == before)
 
 
+def test_the_bar_holds_all_its_parts_however_narrow_the_window(bench: Bench) -> None:
+    dock = bench.page.locator("body > * > .hs-dock")
+    for width in (1024, 780, 1000):
+        bench.page.set_viewport_size({"width": width, "height": 620})
+        bench.page.wait_for_timeout(1000)  # the bar follows the scene
+        bench.eventually(lambda: dock.evaluate("(dock) => dock.scrollWidth <= dock.clientWidth"))
+
+
 def test_the_recording_s_findings_are_in_their_panel(bench: Bench) -> None:
     bench.page.get_by_role("button", name="1 needs attention").click()
     expect(bench.page.get_by_text("--set imu.max_gap=0.4")).to_be_visible()

@@ -209,7 +209,7 @@ const settle = () => {
     if (mover.parentElement !== document.body) { document.body.append(mover); dock.hidden = false; }
     Object.assign(mover.style, {position: 'fixed', zIndex: 11, left: box.left + (phone ? 0 : 8) + 'px',
       width: box.width - (phone ? 0 : 16) + 'px', bottom: phone ? 0 : innerHeight - box.bottom + 8 + 'px'});
-    dock.classList.toggle('narrow', box.width < 640);
+    dock.classList.toggle('narrow', box.width < 800); dock.classList.toggle('wrapped', box.width < 700);
     const sheet = phone && document.querySelector('[style*="max-height: 60%"]'), high = bar.offsetHeight;
     const style = document.documentElement.style;
     const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
