@@ -12,11 +12,12 @@ import viser
 from app.server.keeping import KeepView
 from app.server.protocol import Snapshot
 from app.slam.types import F64
-from app.ui.widgets import Changes, Page, add_button, by_user, show
+from app.ui.widgets import Changes, Page, add_button, by_user
 
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
 """viser has no parallel projection: from far away, through a narrow lens, lines stay parallel to the eye."""
+_LENSES: Final = {"perspective": FOV, "orthographic": _NARROW}
 _LEFT_OUT: Final = 0.1
 """Percent of the points that may lie beyond each edge of a fitted view: few far ones would make the rest small."""
 _LEAST_M: Final = 4.0
@@ -230,17 +231,17 @@ class CameraPanel:
         gui = page.gui
         self._page, self._framing, self._look_freely = page, framing, look_freely
         self._changes = Changes()
-        self._made_parallel = False
+        self._made_parallel: set[int] = set()  # browsers whose view lost its perspective by a plan or a section
         ways = gui.add_button_group(
             "camera",
             (FIT, *_WAYS),
             hint="The whole map, also while it grows; G fits it from the same side. A plan is orthographic, north up.",
         )
         ways.on_click(by_user(self.look))
-        self._parallel = gui.add_checkbox(
-            "orthographic", False, hint="Parallel lines stay parallel, and lengths can be compared."
+        lenses = gui.add_button_group(
+            "lens", tuple(_LENSES), hint="Orthographic: parallel lines stay parallel, and lengths can be compared."
         )
-        self._parallel.on_update(by_user(lambda _, client: self._go(client, self._stand(client))))
+        lenses.on_click(by_user(self._choose_lens))
         add_button(gui, "Keep this view", self._keep, viser.Icon.BOOKMARK)
         self._list = gui.add_button_group(
             "kept views", ("1",), visible=False, hint="Go back to a view that was kept in this session."
@@ -254,11 +255,9 @@ class CameraPanel:
         """Show the whole map from one side, also as it grows."""
         self._look_freely(client)
         if way == PLAN:
-            self._make_parallel()
-            client.camera.fov = _NARROW
-        elif way != FIT and self._made_parallel:
-            self._made_parallel = False
-            show(self._parallel, False)
+            self._make_parallel(client)
+        elif way != FIT and client.client_id in self._made_parallel:
+            self._made_parallel.remove(client.client_id)
             client.camera.fov = FOV
         self._framing.show(client, way, self._page.offset())
 
@@ -269,14 +268,21 @@ class CameraPanel:
             middle: (3,) m, map. size: m, width and height. axes: (3, 3), its own, as columns.
         """
         self._look_freely(client)
-        self._make_parallel()
+        self._make_parallel(client)
         half = 0.6 * max(size[1], size[0] / _picture(client).shape, 1.0)
         self._go(client, Stand(middle - axes[:, 1] * half / np.tan(FOV / 2), middle))
 
-    def _make_parallel(self) -> None:
+    def _choose_lens(self, name: str, client: viser.ClientHandle) -> None:
+        self._made_parallel.discard(client.client_id)
+        stand = self._stand(client)
+        client.camera.fov = _LENSES[name]
+        self._go(client, stand)
+
+    def _make_parallel(self, client: viser.ClientHandle) -> None:
         """Until another side is chosen; where a person chose it, it stays."""
-        self._made_parallel |= not self._parallel.value
-        show(self._parallel, True)
+        if client.camera.fov > FOV / 2:
+            self._made_parallel.add(client.client_id)
+            client.camera.fov = _NARROW
 
     def _stand(self, client: viser.ClientHandle) -> Stand:
         """Where the usual lens would show what this camera shows."""
@@ -308,7 +314,6 @@ class CameraPanel:
 
     def _go(self, client: viser.ClientHandle, stand: Stand) -> None:
         """Move a camera to a stand that is meant for the usual lens."""
-        fov = _NARROW if self._parallel.value else FOV
-        offset, back = self._page.offset(), (stand.position - stand.look_at) * np.tan(FOV / 2) / np.tan(fov / 2)
-        client.camera.fov = fov
+        back = (stand.position - stand.look_at) * np.tan(FOV / 2) / np.tan(client.camera.fov / 2)
+        offset = self._page.offset()
         move(client, Stand(stand.look_at + back + offset, stand.look_at + offset))

@@ -221,7 +221,23 @@ def test_to_fit_keeps_the_plan_and_another_side_ends_it(server: viser.ViserServe
     panel.look(FIT, browser)  # type: ignore[arg-type]
     assert browser.camera.position == pytest.approx(plan) and browser.camera.fov < 0.1
     panel.look(OBLIQUE, browser)  # type: ignore[arg-type]
-    assert browser.camera.fov == FOV and not panel._parallel.value
+    assert browser.camera.fov == FOV
+
+
+def test_each_browser_has_a_lens_of_its_own(server: viser.ViserServer, framed: Framed) -> None:
+    framing, mine, own = framed
+    own.browsers[2] = other = Browser(mine.camera.position)
+    other.client_id = 2
+    panel = CameraPanel(page_of(server), framing, lambda _: None)
+    panel.look(PLAN, mine)  # type: ignore[arg-type]
+    panel.look(OBLIQUE, other)  # type: ignore[arg-type]
+    assert mine.camera.fov < 0.1 and other.camera.fov == FOV
+    panel.look(OBLIQUE, mine)  # type: ignore[arg-type]
+    assert mine.camera.fov == FOV
+    panel._choose_lens("orthographic", mine)  # type: ignore[arg-type]
+    panel.look(PLAN, mine)  # type: ignore[arg-type]
+    panel.look(OBLIQUE, mine)  # type: ignore[arg-type]
+    assert mine.camera.fov < 0.1 and other.camera.fov == FOV, "a lens that a person chose stays"
 
 
 def test_a_view_is_kept_in_the_session_and_gone_back_to(server: viser.ViserServer, framed: Framed) -> None:
