@@ -153,14 +153,14 @@ class History:
         return Columns(starts=starts, stamps=self._columns[_STAMP][starts], low=low, high=high, loops=loops)
 
     def troubles(self, limits: dict[str, float]) -> list[int]:
-        """Frames at which a value becomes bad, or a loop was decided; ascending."""
-        frames = {frame for frame, verdict in self._loops.values() if verdict is not Verdict.CANDIDATE}
+        """First frame of each stretch in which a value, but for the frame time, is bad: the red triangles."""
+        bad = np.zeros(self.total, bool)
         for strip in STRIPS:
-            if strip.key in self._columns and (limit := limits.get(strip.key)) is not None:
+            limit = limits.get(strip.key)
+            if strip.key in self._columns and strip.key != "took" and limit is not None:
                 column = self._columns[strip.key]
-                bad = column > limit if strip.worse == "high" else column < limit
-                frames |= set(np.flatnonzero(bad & ~np.concatenate(([False], bad[:-1]))).tolist())
-        return sorted(frames)
+                bad |= column > limit if strip.worse == "high" else column < limit
+        return np.flatnonzero(bad & ~np.concatenate(([False], bad[:-1]))).tolist()
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,16 +148,22 @@ def test_loops_are_where_they_were_decided_and_stay_there_when_going_back() -> N
     assert not any(history.columns().loops["accepted"])
 
 
-def test_troubles_are_where_something_begins_to_be_bad() -> None:
+def test_troubles_are_where_a_red_stretch_begins_without_slow_frames_and_loops() -> None:
     share = np.full(60, 0.3)
     share[20:25] = 0.0
-    dropped = np.zeros(60)
-    dropped[[31, 32]] = 1
-    one = snapshot(60, 60, ground_share=share, dropped=dropped, degeneracy=np.full(60, 1e4), imu_gap_s=np.zeros(60))
+    dropped, took = np.zeros(60), np.ones(60)
+    dropped[[23, 31, 32]] = 1
+    took[50] = 500.0
+    one = snapshot(
+        60, 60, ground_share=share, dropped=dropped, degeneracy=np.full(60, 1e4), imu_gap_s=np.zeros(60), total_ms=took
+    )
+    nothing = np.empty(0)
+    chunk = Chunk(0, 40, 0, nothing, nothing, nothing, nothing, np.eye(4))  # type: ignore[arg-type]
+    one = replace(one, chunks=(chunk,), loops=LoopsView(edges=(edge(1, 0, Verdict.ACCEPTED),)))
     assert seen(one).troubles(limits(one)) == [20, 31]
 
 
-def test_frames_slower_than_the_sensor_are_trouble() -> None:
+def test_frames_slower_than_the_sensor_are_red() -> None:
     assert limits(snapshot(1, 100))["took"] == pytest.approx(100.0)
 
 
