@@ -14,7 +14,7 @@ from app.export.read_points import CLOUDS
 from app.server.folders import Folders
 from app.server.protocol import Chunk, Snapshot
 from app.ui.background import Background
-from app.ui.colours import DENSITY, DISTANCE, MODES, TABLES, Limits, value_colours
+from app.ui.colours import DENSITY, DISTANCE, LOOK, MODES, TABLES, Limits, value_colours
 from app.ui.files import FileList
 from app.ui.html import Tile, number, panel
 from app.ui.map_numbers import Density, MapNumbers
@@ -38,6 +38,7 @@ class MapComparePanel:
         gui = page.gui
         self._page, self._folders, self._results, self._colour_by = page, folders, results, colour_by
         self._work = Background("compare", "The comparison")
+        self._session, self._before = -1, LOOK  # the colour mode that distances replaced
         self._chunks: tuple[Chunk, ...] = ()  # that were compared last
         self._name, self._share = "", 0.0
         self._comparison: Comparison | None = None
@@ -64,11 +65,16 @@ class MapComparePanel:
 
     def seen(self, current: Snapshot, view: View) -> View:
         """The view with the numbers that its colour mode needs."""
+        if view.colour_by != DISTANCE:
+            self._before = view.colour_by
         if view.colour_by == DENSITY:
             return replace(view, numbers=self._density.of(current.chunks, current.keyframe_poses))
         return replace(view, numbers=self._distance) if view.colour_by == DISTANCE else view
 
     def draw(self, current: Snapshot) -> None:
+        if current.session != self._session:
+            self._session = current.session
+            self._forget()
         self._receive()
         running, recording = self._work.running, current.recording
         self._choose.disabled = self._truth.disabled = running or not current.chunks
@@ -84,6 +90,13 @@ class MapComparePanel:
     def close(self) -> None:
         """Stop the comparison that is running, if any."""
         self._work.stop()
+
+    def _forget(self) -> None:
+        """What was compared belongs to the session before."""
+        self.close()
+        if self._comparison is not None:
+            self._comparison = self._distance = None
+            self._colour_by(self._before)
 
     def _browse(self, client: viser.ClientHandle) -> None:
         folders = Folders([*self._folders.roots, *([self._results] if self._results.is_dir() else [])])

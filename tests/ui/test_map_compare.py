@@ -19,7 +19,7 @@ from app.server.protocol import Chunk, OpenedRecording, Snapshot
 from app.slam.errors import HemislamError
 from app.ui import background
 from app.ui.chunks import MapChunks
-from app.ui.colours import DENSITY, DISTANCE, NOTHING, Limits, key
+from app.ui.colours import DENSITY, DISTANCE, HEIGHT, NOTHING, Limits, key
 from app.ui.map_compare import MapComparePanel, summary
 from app.ui.map_numbers import Density, MapNumbers
 from app.ui.widgets import View
@@ -116,6 +116,19 @@ def test_a_map_that_has_changed_since_is_said_to_be_old(comparing: Comparing) ->
     comparing.now = replace(NOW, chunks=(*CHUNKS, chunk_of(2, 5)), keyframe_poses=np.tile(np.eye(4), (3, 1, 1)))
     comparing.draw()
     assert "changed since" in comparing.panel._found.content
+
+
+def test_another_session_has_no_comparison_and_the_colours_from_before(comparing: Comparing) -> None:
+    comparing.panel.seen(NOW, View(colour_by=HEIGHT))
+    user_clicks(comparing.panel._truth)
+    comparing.draw(FOUND)
+    comparing.panel.seen(NOW, View(colour_by=DISTANCE))
+    user_clicks(comparing.panel._truth)
+    comparing.now = replace(NOW, session=NOW.session + 1)
+    comparing.draw()
+    assert comparing.modes == [DISTANCE, HEIGHT] and comparing.process is None
+    assert not comparing.panel._found.visible
+    assert comparing.panel.seen(comparing.now, View(colour_by=DISTANCE)).numbers is None
 
 
 def test_a_comparison_is_reported_in_numbers() -> None:
