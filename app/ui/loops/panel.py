@@ -150,7 +150,9 @@ class LoopsPanel:
         loops = snapshot.loops
         self._solving.visible = isinstance(command, Solve)
         self._solve.disabled = Solve() in loops.undo or not any(edge.counts for edge in loops.edges)
-        self._folder.visible = self._evidence_folder.visible = edge is not None
+        self._folder.visible = edge is not None
+        considered = command.pair if command is not None else None
+        self._evidence_folder.visible = edge is not None and considered in (None, edge.pair)
         self._edits_folder.visible = len(poses) > 1
         self._residuals_folder.visible = bool(loops.edges)
         self._draw_tables(snapshot)

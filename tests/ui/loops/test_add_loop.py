@@ -8,7 +8,7 @@ from app.slam import lie
 from app.slam.loops.edits import Add
 from tests.ui.conftest import user_clicks
 from tests.ui.fake_loops import KEYFRAMES
-from tests.ui.loops.conftest import Page
+from tests.ui.loops.conftest import GOOD, Page
 
 
 def test_two_keyframes_are_picked_in_the_scene_and_connected_from_where_the_graph_has_them(page: Page) -> None:
@@ -76,11 +76,15 @@ def test_an_untouched_gizmo_is_the_graph_s_own_guess(page: Page) -> None:
 
 
 def test_a_loop_added_by_hand_is_chosen_once_it_arrives(page: Page) -> None:
+    page.choose(GOOD)
+    assert page.loops._evidence_folder.visible
     page.loops._add_loop.suggest_pair((20, 97))
     page.loops._add_loop.suggest()
     page.draw()
+    assert not page.loops._evidence_folder.visible, "it is that of the chosen loop"
     user_clicks(page.loops._proposal._apply)
     page.draw()
     page.draw()
     assert page.loops.chosen == (20, 97) and InspectLoop((20, 97)) in page.engine.sent
+    assert page.loops._evidence_folder.visible
     assert page.says("edited by you 1")
