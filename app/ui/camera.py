@@ -24,8 +24,7 @@ _LEAST_M: Final = 4.0
 _SOME: Final = 20_000
 """Points that say where the map is."""
 _BAR_PX: Final = 80
-_WIDE_PX: Final = 577
-"""Height of the scene's lower edge that the transport covers, on pages of at least this width."""
+"""Height of the scene's lower edge that the transport covers, until a page has said so."""
 _FAR: Final = 10.0
 """Things are drawn up to this many times as far away as the middle of the map."""
 FIT, OBLIQUE, PLAN, TOP, FRONT, SIDE = "fit", "3D", "plan", "top", "front", "side"
@@ -124,6 +123,7 @@ class Framing:
         self._fitted: dict[tuple[object, ...], Stand] = {}
         self._stands: dict[int, Stand] = {}  # of browsers, as last shown
         self._left: set[int] = set()  # browsers whose cameras were sent elsewhere
+        self._covered: dict[int, int] = {}  # pixels of the scenes of browsers
         server.initial_camera.fov = FOV
         self._begin(np.zeros(3))
 
@@ -136,7 +136,7 @@ class Framing:
     @property
     def pictures(self) -> frozenset[tuple[int, Picture]]:
         """Number and picture of each browser."""
-        return frozenset((number, _picture(client)) for number, client in self._server.get_clients().items())
+        return frozenset((number, self.picture(client)) for number, client in self._server.get_clients().items())
 
     def draw(self, offset: F64) -> bool:
         """Move the cameras on; False while they are on their way. offset: (3,) m, of the map in the scene."""
@@ -164,6 +164,18 @@ class Framing:
         """Leave a browser's camera alone: it is sent elsewhere, but a slow browser may still say where it was put."""
         self._left.add(client.client_id)
 
+    def cover(self, client: viser.ClientHandle, pixels: int) -> None:
+        """Keep the map above the transport and the diagnostics, which hide the lower edge of a browser's scene."""
+        self._covered[client.client_id] = pixels
+
+    def picture(self, client: viser.ClientHandle) -> Picture:
+        """What a browser shows the scene in."""
+        camera = client.camera
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        shape = round(width / height, 2) or 0.01
+        covered = round(self._covered.get(client.client_id, _BAR_PX) / height, 2)
+        return Picture(camera.fov, shape, min(covered, 0.4))
+
     def follow(self) -> None:
         """Let every browser look at the sensor, which is kept at the scene's origin."""
         for client in self._server.get_clients().values():
@@ -182,7 +194,7 @@ class Framing:
             self._put.append(position)
 
     def _whole(self, client: viser.ClientHandle) -> Stand:
-        return self._fit(self._ways.get(client.client_id, OBLIQUE), _picture(client))
+        return self._fit(self._ways.get(client.client_id, OBLIQUE), self.picture(client))
 
     def _fit(self, way: str, picture: Picture) -> Stand:
         """The same object while the map is the same."""
@@ -202,14 +214,6 @@ class Framing:
         """Whether the browser's camera is where it was put."""
         off = np.linalg.norm(np.array(self._put) - client.camera.position, axis=1)
         return bool(off.min() < 1e-3 * np.linalg.norm(np.array(client.camera.position) - client.camera.look_at))
-
-
-def _picture(client: viser.ClientHandle) -> Picture:
-    camera = client.camera
-    width, height = max(camera.image_width, 1), max(camera.image_height, 1)
-    shape = round(width / height, 2) or 0.01
-    covered = round(_BAR_PX / height, 2) if width >= _WIDE_PX else 0.0
-    return Picture(camera.fov, shape, min(covered, 0.4))
 
 
 def move(client: viser.ClientHandle, stand: Stand) -> None:
@@ -269,7 +273,7 @@ class CameraPanel:
         """
         self._look_freely(client)
         self._make_parallel(client)
-        half = 0.6 * max(size[1], size[0] / _picture(client).shape, 1.0)
+        half = 0.6 * max(size[1], size[0] / self._framing.picture(client).shape, 1.0)
         self._go(client, Stand(middle - axes[:, 1] * half / np.tan(FOV / 2), middle))
 
     def _choose_lens(self, name: str, client: viser.ClientHandle) -> None:

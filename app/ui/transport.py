@@ -41,13 +41,20 @@ class TransportPanel:
     The strips of `app.ui.timeline` unfold above it.
 
     choose_ends: called with the ends that the user gave the colour bar, in percent of all values.
+    cover: called with a browser and how many pixels of its scene the bar and the strips hide.
     """
 
-    def __init__(self, page: Page, choose_ends: Callable[[int, int], None] = lambda low, high: None) -> None:
+    def __init__(
+        self,
+        page: Page,
+        choose_ends: Callable[[int, int], None] = lambda low, high: None,
+        cover: Callable[[viser.ClientHandle, int], None] = lambda client, pixels: None,
+    ) -> None:
         gui, send = page.gui, page.send
         self._send, self._snapshot, self._choose_ends = page.send, page.snapshot, choose_ends
+        self._cover = cover
         self._changes = Changes(page.now, PANEL_PERIOD_S)
-        self._bridge = Bridge(gui, "transport", lambda word, _: self._asked(word))
+        self._bridge = Bridge(gui, "transport", self._asked)
         gui.add_html(self._bridge.live(panel("transport", list(SPEEDS), source("transport.js"))))
         self._state = gui.add_html("")
         gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self.toggle())
@@ -68,8 +75,8 @@ class TransportPanel:
         ):
             self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
-    def _asked(self, word: str) -> None:
-        """What the page's script sends: "play", "pause", "resume", "step -1", "seek 812", "speed 2×", "ends 0 80"."""
+    def _asked(self, word: str, client: viser.ClientHandle) -> None:
+        """What the page's script sends: "play", "pause", "step -1", "seek 812", "speed 2×", "ends 0 80", "cover 66"."""
         match word.split(" ", 1):
             case ["play"]:
                 self.toggle()
@@ -83,6 +90,8 @@ class TransportPanel:
                 self._send(Seek(int(frame)))
             case ["speed", name] if name in SPEEDS:
                 self._send(SetSpeed(SPEEDS[name]))
+            case ["cover", pixels] if pixels.isdecimal():
+                self._cover(client, int(pixels))
             case ["ends", shares]:
                 low, _, high = shares.partition(" ")
                 if low.isdecimal() and high.isdecimal() and int(low) < int(high) <= 100:

@@ -96,7 +96,9 @@ class Workbench:
 
         prepare_page(gui)
         self._header, scale = HeaderPanel(gui), ScaleBars(page)
-        self._transport = TransportPanel(page, lambda low, high: self._appearance.choose_ends(low, high))
+        self._transport = TransportPanel(
+            page, lambda low, high: self._appearance.choose_ends(low, high), self._scene.framing.cover
+        )
         self._timeline = TimelinePanel(page)
         legend = gui.add_html("")
         files = FilesPanel(page, folders, results)

@@ -164,12 +164,17 @@ def test_the_bar_stays_and_works_while_the_panel_is_closed(bench: Bench) -> None
     bench.eventually(lambda: scene.bounding_box() == before)
 
 
-def test_the_bar_holds_all_its_parts_however_narrow_the_window(bench: Bench) -> None:
-    dock = bench.page.locator("body > * > .hs-dock")
+def test_the_bar_fits_its_window_and_the_map_the_room_above(bench: Bench) -> None:
+    dock, framing = bench.page.locator("body > * > .hs-dock"), bench.workbench._scene.framing
     for width in (1024, 780, 1000):
         bench.page.set_viewport_size({"width": width, "height": 620})
         bench.page.wait_for_timeout(1000)  # the bar follows the scene
         bench.eventually(lambda: dock.evaluate("(dock) => dock.scrollWidth <= dock.clientWidth"))
+    folded = framing.pictures
+    bench.page.get_by_role("button", name="Diagnostics").click()
+    bench.eventually(lambda: framing.pictures != folded)
+    bench.page.get_by_role("button", name="Diagnostics").click()
+    bench.eventually(lambda: framing.pictures == folded)
 
 
 def test_the_recording_s_findings_are_in_their_panel(bench: Bench) -> None:
@@ -345,6 +350,11 @@ def test_on_a_phone_the_scene_has_most_of_the_page_until_a_tab_is_tapped(bench: 
     tab.click()
     bench.eventually(lambda: scene_share() < 0.45)
     expect(page.get_by_text("M scan lines")).to_be_in_viewport()
+    page.get_by_role("button", name="Diagnostics").click()
+    sheet = page.locator("[style*='max-height: 60%']").element_handle()
+    above = "(dock, sheet) => sheet.getBoundingClientRect().bottom < dock.getBoundingClientRect().top + 1"
+    bench.eventually(lambda: page.locator("body > * > .hs-dock").evaluate(above, sheet))
+    page.get_by_role("button", name="Diagnostics").click()
     page.get_by_role("tab", name="Help").first.click()
     page.wait_for_timeout(500)
     assert scene_share() < 0.45, "another tab keeps it up"

@@ -168,6 +168,13 @@ def test_the_map_stays_in_the_picture_as_it_grows(framed: Framed) -> None:
     assert server.initial_camera.position == pytest.approx(whole(HALL).position), "pages that open now"
 
 
+def test_the_map_stays_above_what_covers_the_scene(framed: Framed) -> None:
+    framing, browser, _ = framed
+    framing.cover(browser, 300)  # type: ignore[arg-type]
+    settle(framing)
+    assert browser.camera.position == pytest.approx(whole(HALL / 4, OBLIQUE, Picture(shape=1.6, covered=0.3)).position)
+
+
 def test_in_a_picture_that_is_higher_than_wide_all_of_the_map_is_seen_too(framed: Framed) -> None:
     framing, browser, _ = framed
     wide = browser.distance()

@@ -10,7 +10,7 @@ mover.home = home;
 window.hemislamDock = mover;
 for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-dock')) old.remove();
 const HEAD = 20, NAME = 78, VALUE = 72, ROW = 19, HELD_MS = 1000;
-let TEXT, QUIET, GOOD, BAD, NOTE, d = null, text = '', hover = null, scrubbing = false, said = 0, touched = -HELD_MS;
+let TEXT, QUIET, GOOD, BAD, NOTE, d = null, text = '', hover = null, scrubbing = false, said = 0, touched = -HELD_MS, covered = -1;
 const paint = () => { // in the colours of the theme
   const style = getComputedStyle(dock);
   [TEXT, QUIET, GOOD, BAD, NOTE] = ['text', 'quiet', 'good', 'bad', 'warn'].map((n) => style.getPropertyValue('--hs-' + n));
@@ -210,10 +210,12 @@ const settle = () => {
     Object.assign(mover.style, {position: 'fixed', zIndex: 11, left: box.left + (phone ? 0 : 8) + 'px',
       width: box.width - (phone ? 0 : 16) + 'px', bottom: phone ? 0 : innerHeight - box.bottom + 8 + 'px'});
     dock.classList.toggle('narrow', box.width < 800); dock.classList.toggle('wrapped', box.width < 700);
-    const sheet = phone && document.querySelector('[style*="max-height: 60%"]'), high = bar.offsetHeight;
+    const sheet = phone && document.querySelector('[style*="max-height: 60%"]'), high = dock.offsetHeight;
     const style = document.documentElement.style;
     const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
     put('--hs-beside', innerWidth - box.right); put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
+    const hidden = Math.max(0, Math.round(box.bottom + 8 - dock.getBoundingClientRect().top));
+    if (hidden !== covered) { covered = hidden; tell('cover ' + hidden); }
   }
   setTimeout(settle, 300);
 };
