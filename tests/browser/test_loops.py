@@ -98,6 +98,9 @@ def test_the_tabs_stay_in_view_while_the_panel_is_scrolled(bench: Bench) -> None
     expect(page.get_by_text("hall_bpearl.mcap")).not_to_be_in_viewport()
     for name in ("Parameters", "Help"):
         expect(page.get_by_role("tab", name=name)).to_be_in_viewport(ratio=1)
+    layer = "(element) => Number(getComputedStyle(element).zIndex)"
+    tabs, knob = page.locator("[role=tablist]:has([data-dock-tab])").last, page.locator(".mantine-Slider-thumb").first
+    assert tabs.evaluate(layer) > knob.evaluate(layer), "a knob does not shine through them"
 
 
 def test_edits_are_downloaded_as_the_command_line_takes_them(bench: Bench) -> None:
