@@ -74,7 +74,7 @@ class MapComparePanel:
     def draw(self, current: Snapshot) -> None:
         if current.session != self._session:
             self._session = current.session
-            self._forget()
+            self._clear()
         self._receive()
         running, recording = self._work.running, current.recording
         self._choose.disabled = self._truth.disabled = running or not current.chunks
@@ -91,7 +91,7 @@ class MapComparePanel:
         """Stop the comparison that is running, if any."""
         self._work.stop()
 
-    def _forget(self) -> None:
+    def _clear(self) -> None:
         """What was compared belongs to the session before."""
         self.close()
         if self._comparison is not None:
