@@ -21,10 +21,10 @@ from scipy import optimize
 from app.georeference.drift import constants_despite_drift, drift_deviations
 from app.georeference.fixes import Fixes
 from app.georeference.ground import Ground
-from app.georeference.path import SEARCH_S, PathOverTime
+from app.georeference.path import SEARCH_S, PathOverTime, aligned_robustly
 from app.georeference.reference import ELLIPSOIDAL, GeoReference
 from app.slam import lie
-from app.slam.arrays import F64, Mask, Vector
+from app.slam.arrays import F64, I64, Mask, Vector
 from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory
 
@@ -36,6 +36,8 @@ MEDIAN_SIGMAS = 1.538
 """The same for half of them."""
 LEVEL = np.radians(0.5)
 """Standard deviation of the map's tilt before any fix: that of an accelerometer biased by 0.09 m/s²."""
+NEARBY_S = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6)
+"""Added to it where the lever arm is unknown too: an antenna ahead of the IMU looks much like an early clock."""
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 """What is less certain than this (standard deviation) is not taken from the fixes."""
 NOTABLE_SCATTER = 3.0
@@ -219,10 +221,14 @@ class _Problem:
     def solve(self) -> _Solved:
         """All unknowns at once, first robustly, then by the fixes that agree."""
         late, free = self.offset is not None, self.lever_free
-        some = self.overrides != 0
-        antenna = self.path.antenna(self.seconds[some] - (self.offset or 0.0), self.lever)
-        yaw, shift, _ = aligned_robustly(antenna, self.places[some])
-        start = np.r_[yaw, shift, 0.0, 0.0, [self.offset] * late, [0.0] * (3 * free)].astype(np.float64)
+        some = self._part(np.flatnonzero(self.overrides != 0))
+        if (count := len(some.seconds)) < FEWEST:
+            raise HemislamError(f"Only {count} fixes are left, {FEWEST} are needed; accept some of them again.")
+        start = some._start(self.offset or 0.0)
+        if self.offset is not None and free:
+            few = some._part(_evenly(count))
+            fits = [_fit_robustly(few._errors, few._start(self.offset + nearby)) for nearby in NEARBY_S]
+            start = min(fits, key=lambda fit: float(fit.cost)).x
         x, used = _robust(self._errors, start, self.overrides)
         R, shift, offset, arm = self._model(x)
         errors = self._errors(x)
@@ -242,6 +248,17 @@ class _Problem:
             float(sigmas[0]),
             float(sigmas[-3:].max()) if free else float("nan"),
         )
+
+    def _part(self, rows: I64) -> "_Problem":
+        """The same with only these fixes."""
+        arrays = ("seconds", "places", "sigmas", "overrides")
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
+
+    def _start(self, offset: float) -> F64:
+        """The unknowns to start from with this offset; no tilt, no free lever arm."""
+        yaw, shift, _ = aligned_robustly(self.path.antenna(self.seconds - offset, self.lever), self.places)
+        late, free = self.offset is not None, self.lever_free
+        return np.asarray(np.r_[yaw, shift, 0.0, 0.0, [offset] * late, [0.0] * (3 * free)], np.float64)
 
     def with_drift(self, solved: _Solved) -> _Solved:
         """The same, with standard deviations that count drift, and constants of the receiver that it hardly pulls."""
@@ -300,13 +317,15 @@ def _deviations(J: F64) -> F64:
     return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)) / lengths)
 
 
+def _fit_robustly(errors: Callable[[F64], F64], start: F64) -> Any:
+    """SciPy's result, by all fixes. errors: (n, 3) whitened."""
+    return _fit(lambda x: _with_level(errors(x), x), start, loss="cauchy", f_scale=2.0)
+
+
 def _robust(errors: Callable[[F64], F64], start: F64, overrides: F64) -> tuple[F64, Mask]:
     """The optimum by the fixes that agree or that the user counts, and which these are. errors: (n, 3) whitened."""
     used = np.asarray(overrides != 0)
-    if used.sum() < FEWEST:
-        raise HemislamError(f"Only {used.sum()} fixes are left, {FEWEST} are needed; accept some of them again.")
-    first = _fit(lambda x: _with_level(errors(x)[used], x), start, loss="cauchy", f_scale=2.0)
-    x = np.asarray(first.x)
+    x = np.asarray(_fit_robustly(lambda x: errors(x)[used], start).x)
     for _ in range(10):
         distances = np.linalg.norm(errors(x), axis=1)
         scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
@@ -328,7 +347,7 @@ def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:
 
 def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search: bool = True) -> tuple[float, float]:
     """The offset (s; 0 without a search) with which the fixes fit best, and how far off (m) they are in the median."""
-    few = np.unique(np.linspace(0, len(seconds) - 1, COARSE_FIXES).astype(int))
+    few = _evenly(len(seconds))
     best = (np.inf, 0.0, np.inf)
     offsets = np.arange(-SEARCH_S, SEARCH_S + COARSE_S / 2, COARSE_S) if search else np.zeros(1)
     for offset in offsets[np.argsort(np.abs(offsets), kind="stable")].tolist():
@@ -342,31 +361,16 @@ def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search
     return best[1], best[2]
 
 
+def _evenly(count: int) -> I64:
+    """Rows of at most `COARSE_FIXES` of so many."""
+    return np.unique(np.linspace(0, count - 1, COARSE_FIXES).astype(np.int64))
+
+
 def _too_few(path: PathOverTime, seconds: F64) -> HemislamError:
     return HemislamError(
         f"Only {path.known(seconds).sum()} fixes lie within the time of the trajectory, {FEWEST} are needed: they begin"
         f" {seconds[0]:.0f} s and end {seconds[-1]:.0f} s after its start; both must be stamped in UTC."
     )
-
-
-def aligned_robustly(points: F64, places: F64) -> tuple[float, F64, F64]:
-    """The yaw (rad) and shift (3,) that move points (n, 3) onto places with the smallest sum of distances.
-
-    Returns also how far each is off, m (n,). By reweighted least squares (Weiszfeld), so that a few wrong ones do not
-    matter.
-    """
-    weights = np.ones(len(points))
-    for _ in range(8):
-        share = weights / weights.sum()
-        middle, there = share @ points, share @ places
-        a, b = points - middle, places - there
-        sine = share @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-        yaw = float(np.arctan2(sine, share @ (a[:, :2] * b[:, :2]).sum(axis=1)))
-        R = lie.exp(np.array([0.0, 0.0, yaw]))
-        shift = there - R @ middle
-        off = np.linalg.norm(places - points @ R.T - shift, axis=1)
-        weights = 1.0 / np.maximum(off, 1e-3)
-    return yaw, shift, off
 
 
 def _refuse_unlike(solved: _Solved, places: F64) -> None:

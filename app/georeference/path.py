@@ -1,9 +1,10 @@
-"""The path of the IMU, and of an antenna on it, at any time between the poses of a trajectory."""
+"""The path of the IMU, and of an antenna on it, at any time between the poses of a trajectory; where it fits places."""
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
+from app.slam import lie
 from app.slam.arrays import F64, Mask
 from app.slam.trajectory import Trajectory
 
@@ -44,3 +45,23 @@ class PathOverTime:
         inside = np.clip(t, self._times[0], self._times[-1])
         turns: Rotation = self._turns(inside)
         return np.asarray(self._places(inside) + turns.apply(lever))
+
+
+def aligned_robustly(points: F64, places: F64) -> tuple[float, F64, F64]:
+    """The yaw (rad) and shift (3,) that move points (n, 3) onto places with the smallest sum of distances.
+
+    Returns also how far each is off, m (n,). By reweighted least squares (Weiszfeld), so that a few wrong ones do not
+    matter.
+    """
+    weights = np.ones(len(points))
+    for _ in range(8):
+        share = weights / weights.sum()
+        middle, there = share @ points, share @ places
+        a, b = points - middle, places - there
+        sine = share @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        yaw = float(np.arctan2(sine, share @ (a[:, :2] * b[:, :2]).sum(axis=1)))
+        R = lie.exp(np.array([0.0, 0.0, yaw]))
+        shift = there - R @ middle
+        off = np.linalg.norm(places - points @ R.T - shift, axis=1)
+        weights = 1.0 / np.maximum(off, 1e-3)
+    return yaw, shift, off

@@ -4,6 +4,7 @@ Tests app/georeference/align.py, app/georeference/ground.py, app/georeference/pa
 """
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from app.georeference.fixes import Fixes
 from app.georeference.ledger import summary
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.trajectory import Trajectory
+from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import F64
 from tests.georeference.walks import LEVER, LINE, LOOP, TRUTH, Walked, off, walked
 
@@ -72,6 +73,18 @@ def test_the_lever_arm_is_found_with_its_uncertainty_where_the_hand_turns_enough
     found = align(made.trajectory, made.fixes)
     assert found.lever_sigma < 0.05
     assert np.abs(np.subtract(found.lever_arm, LEVER)).max() < 4 * found.lever_sigma
+
+
+@pytest.mark.parametrize("walk", ["hall_bpearl", "outdoor_bpearl"])
+def test_an_antenna_ahead_of_the_walker_is_not_taken_for_an_early_clock(walk: str, shared_data: Path) -> None:
+    trajectory, lever = read_tum(shared_data / f"{walk}_truth.tum"), (0.0, 0.0, 0.5)
+    positions, rotations, some = trajectory.positions, trajectory.rotations, slice(5, -5, 2)
+    places = (positions + rotations.apply(lever))[some]
+    places += np.random.default_rng(0).normal(0.0, 0.01, places.shape)
+    fixes = Fixes.of(trajectory.stamps_ns[some], TRUTH.to_geographic(places), np.full(places.shape, 0.01))
+    found = align(trajectory, fixes)
+    assert abs(found.offset_s) < 0.01
+    assert np.abs(np.subtract(found.lever_arm, lever)).max() < 4 * found.lever_sigma < 0.08
 
 
 def test_a_lever_arm_left_out_shows_in_the_residuals() -> None:
