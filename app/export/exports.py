@@ -20,7 +20,7 @@ from app.export.results import Results
 from app.georeference import ledger, reference
 from app.slam import report
 from app.slam.errors import HemislamError
-from app.slam.loops.files import loops_csv
+from app.slam.loops.files import loops_csv, moved_g2o
 from app.slam.loops.types import Verdict
 from app.slam.map_frame import NO_PAUSES
 from app.slam.provenance import hash_input
@@ -90,7 +90,7 @@ def _write_loops(path: Path, results: Results) -> None:
 
 def _write_graph(path: Path, results: Results) -> None:
     assert results.loops is not None
-    path.write_text(results.loops.g2o, encoding="utf-8")
+    path.write_text(moved_g2o(results.loops.g2o, results.adjustment), encoding="utf-8")
 
 
 def _write_report(path: Path, results: Results) -> None:

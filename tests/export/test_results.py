@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from app.export.box import Box
 from app.export.exports import BY_RUN, EXPORTS, save_results
@@ -22,6 +23,7 @@ from app.export.results import Results
 from app.georeference import reference
 from app.slam.errors import HemislamError
 from app.slam.frames import Frame
+from app.slam.loops.files import LoopResults
 from app.slam.map_frame import MapFrame
 from app.slam.params import Params
 from app.slam.report import summarise
@@ -236,6 +238,23 @@ def test_the_map_holds_every_keyframe_where_loops_place_it(tmp_path: Path) -> No
     )
     assert points["ground"].tolist() == [1, 0, 1]
     assert points["intensity"].tolist() == [0, 1, 0]
+
+
+def test_the_graph_lies_where_the_trajectory_and_the_map_lie(tmp_path: Path, recording: Path) -> None:
+    """Oracle: SciPy, of the levelled trajectory."""
+    log, keyframes = logged(), [keyframe(k, [[1, 0, 0]], [GROUND]) for k in (0, 5)]
+    level = MapFrame.levelling(np.array([0.1, 0.2, -9.8]))
+    rows = zip((0, 5), log.odometry.positions[[0, 5]], log.odometry.quaternions[[0, 5]], strict=True)
+    vertices = [f"VERTEX_SE3:QUAT {k // 5} " + " ".join(map(str, (*p, *q))) for k, p, q in rows]
+    edge = "EDGE_SE3:QUAT 0 1 5 0 0 0 0 0 1 " + " ".join(["1"] * 21)
+    graph = LoopResults(MapFrame(), np.array([0, 1]), (), "\n".join([*vertices, edge, ""]))
+    save_results(tmp_path, Results(log, keyframes, RunInfo(recording, Params()), graph, level))
+    *lines, last = (tmp_path / "graph.g2o").read_text().splitlines()
+    written, trajectory = np.array([line.split()[2:] for line in lines], float), read_tum(tmp_path / "trajectory.tum")
+    np.testing.assert_allclose(written[:, :3], trajectory.positions[[0, 5]], atol=1e-6)
+    turns = Rotation.from_quat(written[:, 3:]).inv() * trajectory.rotations[[0, 5]]
+    assert turns.magnitude().max() < 1e-6 and last == edge
+    assert abs(written[1, 2] - log.odometry.positions[5, 2]) > 0.05
 
 
 def test_results_are_not_overwritten_unless_asked(tmp_path: Path, recording: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from app.slam import lie
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.map_frame import MapFrame
 from app.slam.text_files import csv_text
@@ -42,6 +43,19 @@ class LoopResults:
 
     def count(self, verdict: Verdict) -> int:
         return sum(edge.verdict is verdict for edge in self.edges)
+
+
+def moved_g2o(text: str, frame: MapFrame) -> str:
+    """The text of a g2o file with its vertices, T_map_imu of keyframes, where `frame` puts them."""
+    lines = text.splitlines()
+    for number, line in enumerate(lines):
+        if line.startswith("VERTEX_SE3:QUAT"):
+            kind, key, *pose = line.split()
+            values = np.array(pose, np.float64)
+            T = frame.at(int(key)) @ lie.transform(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
+            moved = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
+            lines[number] = " ".join([kind, key, *(f"{value:.9g}" for value in moved)])
+    return "\n".join(lines) + "\n"
 
 
 def tied_pauses(edges: Iterable[LoopEdge], stamps_ns: I64, pauses_ns: I64) -> I64:
