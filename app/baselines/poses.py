@@ -38,5 +38,6 @@ def keep_keyframe(store: KeyframeStore, scan: Scan, now: Stamped, last: Stamped 
         points = undistorted(points, shares, motion)
     n = len(points)
     labels = np.full(n, NON_GROUND, np.uint8)
-    cloud = Cloud(points.astype(np.float32), labels, scan.intensity, scan.ring, scan.offsets_ns)
+    offsets_ns = scan.offsets_ns - np.int32(stamp_ns - scan.stamp_ns)
+    cloud = Cloud(points.astype(np.float32), labels, scan.intensity, scan.ring, offsets_ns)
     store.append(Keyframe(len(store), -1, stamp_ns, T_odom_imu, T_imu_lidar, np.zeros((6, 6)), cloud))

@@ -94,6 +94,7 @@ def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
     T = T_map_odom @ keyframe.T_odom_imu @ keyframe.T_imu_lidar
     points = np.empty((len(cloud), 3))
     transform(cloud.points, T, points)
+    # offsets count from the scan's end; in older stores, from its begin, and the last point is taken for the end
     begin_ns = keyframe.stamp_ns - int(cloud.offsets_ns.max(initial=0))
     stamps_ns = begin_ns + cloud.offsets_ns.astype(np.int64)
     return Block(keyframe.index, keyframe.stamp_ns, T, points, stamps_ns, cloud.labels, cloud.intensity, cloud.ring)

@@ -170,7 +170,8 @@ class Engine:
         keyframe, certainty = None, before.certainty
         if due:
             certainty = (certainty or Certainty.begin(posterior, refined=p.filter.estimate_extrinsics)).moved(posterior)
-            keyframe = self._keyframe(posterior, cloud, certainty, paused, astray=contradicted)
+            kept = replace(cloud, offsets_ns=cloud.offsets_ns - np.int32(end_ns - scan.stamp_ns))
+            keyframe = self._keyframe(posterior, kept, certainty, paused, astray=contradicted)
         watch.lap("keyframe")
 
         result = StepResult(

@@ -285,7 +285,7 @@ class Keyframe:
         index: 0, 1, 2, ... frame: index of the frame it was taken from. stamp_ns: scan end.
         T_odom_imu: (4, 4) pose by odometry. T_imu_lidar: (4, 4) at that moment.
         covariance: (6, 6) of the pose against the local map, rotation (IMU frame) then translation (odom).
-        cloud: in the LiDAR frame at `stamp_ns`.
+        cloud: in the LiDAR frame at `stamp_ns`, from which its `offsets_ns` count, <= 0.
         drift: (6, 6) what adds to it since the first keyframe.
         resumed_ns: when the scans went on, if it is the first after a pause (`app.slam.pause`); otherwise 0.
         astray: m, standard deviation by which odometry may be off since the last keyframe, if a scan contradicted it;

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from app.export.points import EVERYTHING, blocks
 from app.slam.engine import Engine
+from app.slam.map_frame import MapFrame
 from app.slam.types import STAGES, FrameStatus
 from tests.slam.engine_runs import ALONG, FRAMES, REAL, assert_all_same, assert_same, room_walk, run, worst
 from tests.slam.scenes import (
@@ -169,6 +171,18 @@ def test_input_is_left_as_it_was() -> None:
 
 
 # --- keyframes -----------------------------------------------------------------------------------
+def test_points_of_a_keyframe_keep_their_times_when_the_scan_ends_out_of_range() -> None:
+    """Its last third is of the operator, nearer than the least range."""
+    engine = Engine(params_for(REAL))
+    for m in room_walk():
+        kept = m.scan.offsets_ns < 2 / 3 * m.scan.offsets_ns.max()
+        points = np.where(kept[:, None], m.scan.points, np.float32(0.01) * m.scan.points)
+        if engine.step(replace(m.scan, points=points), m.imu).keyframe is not None:
+            break
+    (block,) = blocks(engine.keyframes, MapFrame(), EVERYTHING)
+    assert np.array_equal(block.stamps_ns, m.scan.stamp_ns + m.scan.offsets_ns[kept].astype(np.int64))
+
+
 def test_keyframes_are_stored_as_they_were_reported() -> None:
     engine = Engine(params_for(REAL, {"keyframe.distance": 0.2}))
     reported = [r for r in run(engine, room_walk()) if r.keyframe is not None]
@@ -180,7 +194,7 @@ def test_keyframes_are_stored_as_they_were_reported() -> None:
         assert stored.frame == r.index
         assert stored.stamp_ns == r.stamp_ns
         np.testing.assert_array_equal(stored.T_odom_imu, r.state.T_odom_imu)
-        assert_same(stored.cloud, r.cloud)
+        assert_same(stored.cloud, r.cloud, ("offsets_ns",))
         assert np.linalg.eigvalsh(stored.covariance)[0] > 0
     steps = np.diff([k.T_odom_imu[:3, 3] for k in engine.keyframes], axis=0)
     assert np.linalg.norm(steps, axis=1).max() < 0.2 + 0.15
