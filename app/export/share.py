@@ -60,9 +60,8 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: Resul
     colours = _colours(points[:, 2])
     tiles, which = np.unique(np.floor(points[:, :2] / TILE).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
-    for number, (tile, part) in enumerate(
-        zip(tiles, np.split(order, np.cumsum(np.bincount(which.ravel()))[:-1]), strict=True)
-    ):
+    parts = np.split(order, np.cumsum(np.bincount(which.ravel())))  # and an empty one after the last tile
+    for number, (tile, part) in enumerate(zip(tiles, parts, strict=False)):
         center = np.append((tile + 0.5) * TILE, np.median(points[part, 2]))
         own = (points[part] - center).astype(np.float32)
         scene.add_point_cloud(
