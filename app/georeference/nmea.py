@@ -41,7 +41,7 @@ class Sentences:
             elif kind.endswith("GST") and len(words) > 7 and words[5]:
                 north, east, up = (float(word) for word in words[5:8])
                 self._sigmas[_seconds(words[0])] = east, north, up
-            elif kind.endswith("RMC") and len(words) > 8 and words[8]:
+            elif kind.endswith("RMC") and len(words) > 8 and words[1] == "A" and words[8]:
                 self._day(datetime.strptime(words[8], "%d%m%y"), words[0])
             elif kind.endswith("ZDA") and len(words) > 3 and words[3]:
                 self._day(datetime.strptime("".join(words[1:4]), "%d%m%Y"), words[0])

@@ -29,6 +29,13 @@ def test_a_sentence_with_the_date_overrides_the_recordings_day() -> None:
     assert (fixes.stamps_ns == 764_426_119 * 10**9).all()  # 1994-03-23T12:35:19Z
 
 
+def test_the_date_of_a_receiver_without_a_fix_does_not_count() -> None:
+    """After a cold start it is that of its own clock."""
+    void = "$GPRMC,000010.00,V,,,,,,,060180,,,N*73"
+    fixes, _ = nmea.read([GGA, void], "log", 764_426_000 * 10**9)
+    assert (fixes.stamps_ns == 764_426_119 * 10**9).all()
+
+
 def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
     gst = "$GPGST,123519,0.006,0.023,0.020,273.6,0.023,0.020,0.031*"
     value = 0
