@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +27,6 @@ from app.slam.provenance import hash_input
 from app.slam.text_files import make_folder, write_texts
 from app.slam.trajectory import stamp_text, write_tum
 from app.slam.types import F64, I64, TIMINGS
-
-if TYPE_CHECKING:  # every run imports this module, and few need the solver
-    pass
 
 EXTRAS = {"e57": ("pye57",), "plan": ("ezdxf", "rasterio")}
 """Modules that the extras of the package install."""

@@ -21,7 +21,7 @@ HINTS: Final[dict[str, str]] = {
     "dropped": "Scans left out because the engine was behind.",
     # loops
     "overlap": "Points near both keyframes that have a partner in the other submap, in percent.",
-    "slide": "How far registrations from disturbed starts end from one another, in mm.",
+    "slide": "How far registrations from disturbed starts end from the result, in mm.",
     "to odometry": "Distance to what odometry expects, in its standard deviations (σ).",
     "odometry ±": "Standard deviation of what odometry expects, in m.",
     "support": "Loops nearby that agree with this one.",

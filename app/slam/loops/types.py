@@ -46,7 +46,7 @@ class Evidence:
         residual_rms: m, point to plane, of those.
         condition: smallest eigenvalue of the registration's translation information over its
             largest, 0-1; near 0 the two submaps slide along each other.
-        slide: m, how far registrations from disturbed starts ended from one another.
+        slide: m, how far registrations from disturbed starts ended from the result, along its least certain direction.
         alternative_m: m to the nearest other alignment that fits as well and that odometry also allows; inf if
             there is none.
         mahalanobis: distance to what odometry predicts, in standard deviations.
