@@ -169,10 +169,12 @@ def test_the_bar_fits_its_window_and_the_map_the_room_above(bench: Bench) -> Non
     for width in (1024, 780, 1000):
         bench.page.set_viewport_size({"width": width, "height": 620})
         bench.page.wait_for_timeout(1000)  # the bar follows the scene
-        bench.eventually(lambda: dock.evaluate("(dock) => dock.scrollWidth <= dock.clientWidth"))
+        assert dock.evaluate("(dock) => dock.scrollWidth <= dock.clientWidth"), f"{width} px"
     folded = framing.pictures
     bench.page.get_by_role("button", name="Diagnostics").click()
     bench.eventually(lambda: framing.pictures != folded)
+    (((_, before),), ((_, after),)) = folded, framing.pictures
+    assert after.covered > before.covered
     bench.page.get_by_role("button", name="Diagnostics").click()
     bench.eventually(lambda: framing.pictures == folded)
 

@@ -111,7 +111,7 @@ def test_nothing_is_sent_to_the_page_while_no_note_is_added(notes: Notes, wire: 
 
 
 class Browser:
-    """One that was asked for a text in a dialog; what it is told."""
+    """A browser that shows a dialog. told: its notifications. added: the dialog's controls by their labels."""
 
     def __init__(self, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
         self.gui, self.told, self.added = server.gui, list[str](), dict[str, Any]()
