@@ -313,6 +313,13 @@ def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -
         page.close()
 
 
+def test_what_is_asked_for_in_the_same_moment_all_arrives(bench: Bench) -> None:
+    bench.engine.sent.clear()
+    bench.page.evaluate("for (const word of ['cover 66', 'speed 2×', 'step 1', 'cover 70']) hemislamTransport(word)")
+    bench.eventually(lambda: StepFrame(1) in bench.engine.sent)
+    assert SetSpeed(2.0) in bench.engine.sent
+
+
 def test_a_click_on_the_map_measures_the_point_under_it(bench: Bench) -> None:
     for _ in range(14):
         bench.engine.send(StepFrame())

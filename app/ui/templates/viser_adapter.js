@@ -1,17 +1,27 @@
 // Runs once in each page. What it relies on in viser's page is listed in app/ui/viser_adapter.py.
 if (!window.hemislamSay) {
   // A click (or Enter) on an element with data-hs: write its word into the hidden field, whose changes viser sends.
-  // The number behind the word makes every click a change.
-  let said = 0;
-  const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set;
+  // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, so
+  // words wait for each other; of two that ask for the same thing the later one counts.
+  let said = 0, sending = 0;
+  const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set, waiting = new Map();
+  const send = () => {
+    const [next] = waiting;
+    sending = next ? setTimeout(send, 60) : 0;
+    if (!next) return;
+    const [key, [name, word]] = next, bridge = document.querySelector(`.hs-bridge[data-name="${name}"]`);
+    waiting.delete(key);
+    const input = bridge?.parentElement.previousElementSibling.querySelector('input');
+    if (!input) return; // taken off the page meanwhile
+    set.call(input, word + ' #' + (++said) + Math.random().toString(36).slice(2, 6));
+    input.dispatchEvent(new Event('input', {bubbles: true}));
+  };
   window.hemislamSay = (event) => {
     const element = event.target.closest && event.target.closest('[data-hs]');
     if (!element || (event.type === 'keydown' && (event.key !== 'Enter' || element.tagName === 'BUTTON'))) return;
-    const name = element.closest('[data-hs-to]').dataset.hsTo;
-    const bridge = document.querySelector(`.hs-bridge[data-name="${name}"]`);
-    const input = bridge.parentElement.previousElementSibling.querySelector('input');
-    set.call(input, element.dataset.hs + ' #' + (++said) + Math.random().toString(36).slice(2, 6));
-    input.dispatchEvent(new Event('input', {bubbles: true}));
+    const name = element.closest('[data-hs-to]').dataset.hsTo, word = element.dataset.hs;
+    waiting.set(name + ' ' + word.split(' ')[0], [name, word]);
+    if (!sending) send();
   };
 
   // On a phone the panel is low, its tabs alone, until one is tapped; the same one lowers it again.
