@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import ground, iekf, lie
-from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief, Path
+from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief, Path, at_origin
 from app.slam.kernels import motion
 from app.slam.kernels.registration import EDGE_ON, REPEATED, RESIDUAL_HUBER
 from app.slam.local_map import LocalMap
@@ -100,18 +100,7 @@ def standing(stamp_ns: int, R_odom_imu: F64, params: Params) -> Belief:
     sigma[ROT] = sigma[POS] = 1e-4
     sigma[VEL], sigma[BG], sigma[BA], sigma[GRAV] = FIRST_SPEED, FIRST_RATE, 1e-3, 1e-3
     sigma[EXT_ROT] = sigma[EXT_POS] = 1e-6
-    state = NavState(
-        stamp_ns=stamp_ns,
-        R_odom_imu=R_odom_imu,
-        p_odom_imu=np.zeros(3),
-        v_odom_imu=np.zeros(3),
-        b_gyro=np.zeros(3),
-        b_accel=np.zeros(3),
-        g_odom=np.array([0.0, 0.0, -params.imu.gravity]),
-        R_imu_lidar=lie.from_rpy_degrees(params.sensor.rotation),
-        p_imu_lidar=np.array(params.sensor.translation, dtype=np.float64),
-    )
-    return Belief(state, np.diag(sigma**2))
+    return at_origin(stamp_ns, R_odom_imu, np.zeros(3), sigma, params)
 
 
 def without_imu(belief: Belief) -> Belief:

@@ -7,6 +7,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.clock import USUAL_S
 from app.slam.kernels import manifold, motion
+from app.slam.params import Params
 from app.slam.sections import ImuParams
 from app.slam.types import F32, F64, ImuSamples, NavState, Scan
 
@@ -53,6 +54,26 @@ class Path:
 
     times: F64
     poses: F64
+
+
+def at_origin(stamp_ns: int, R_odom_imu: F64, b_gyro: F64, sigma: F64, params: Params) -> Belief:
+    """Belief at odom's origin: not moving, mounted as the parameters say, with gravity along -z.
+
+    Args:
+        R_odom_imu: (3, 3). b_gyro: (3,) rad/s. sigma: (DIM,) standard deviations.
+    """
+    state = NavState(
+        stamp_ns=stamp_ns,
+        R_odom_imu=R_odom_imu,
+        p_odom_imu=np.zeros(3),
+        v_odom_imu=np.zeros(3),
+        b_gyro=b_gyro,
+        b_accel=np.zeros(3),
+        g_odom=np.array([0.0, 0.0, -params.imu.gravity]),
+        R_imu_lidar=lie.from_rpy_degrees(params.sensor.rotation),
+        p_imu_lidar=np.array(params.sensor.translation, dtype=np.float64),
+    )
+    return Belief(state, np.diag(sigma**2))
 
 
 def mounting_to_pose(state: NavState) -> F64:

@@ -17,10 +17,11 @@ from app.slam.imu import (
     VEL,
     WALKING,
     Belief,
+    at_origin,
     seen_from_the_lidar,
 )
 from app.slam.params import Params
-from app.slam.types import ImuSamples, NavState, Scan
+from app.slam.types import ImuSamples, Scan
 
 LEAST_STILL = 0.3
 """s; a shorter rest does not determine the gyroscope's bias."""
@@ -98,19 +99,8 @@ def _sigma() -> np.ndarray:
 
 
 def _belief(imu: ImuSamples, stamp_ns: int, b_gyro: np.ndarray, sigma: np.ndarray, params: Params) -> Belief:
-    up = imu.accel.mean(axis=0)
-    state = NavState(
-        stamp_ns=stamp_ns,
-        R_odom_imu=lie.between(up, np.array([0.0, 0.0, 1.0])),
-        p_odom_imu=np.zeros(3),
-        v_odom_imu=np.zeros(3),
-        b_gyro=b_gyro,
-        b_accel=np.zeros(3),
-        g_odom=np.array([0.0, 0.0, -params.imu.gravity]),
-        R_imu_lidar=lie.from_rpy_degrees(params.sensor.rotation),
-        p_imu_lidar=np.array(params.sensor.translation, dtype=np.float64),
-    )
-    belief = Belief(state, np.diag(sigma**2))
+    R_odom_imu = lie.between(imu.accel.mean(axis=0), np.array([0.0, 0.0, 1.0]))
+    belief = at_origin(stamp_ns, R_odom_imu, b_gyro, sigma, params)
     return seen_from_the_lidar(belief) if params.filter.estimate_extrinsics else belief
 
 

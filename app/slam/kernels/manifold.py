@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from app.slam.kernels.small import copy, cross, rotation
+from app.slam.kernels.small import across, copy, cross, rotation
 
 
 @njit(cache=True)
@@ -68,21 +68,13 @@ def right_jacobian_inverse(v):
 
 @njit(cache=True)
 def tangent_basis(g):
-    """(3, 2) orthonormal basis of the plane across g (3,), smooth except where |g_x| crosses 0.8 |g|.
+    """(3, 2) orthonormal basis of the plane across g (3,), by `across`.
 
     It must not jump near the vertical, where gravity is: the covariance is expressed in it.
     """
     n = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-    ux, uy, uz = g[0] / n, g[1] / n, g[2] / n
-    if abs(ux) < 0.8:  # u x e for an axis e well across u
-        bx, by, bz = 0.0, uz, -uy
-    else:
-        bx, by, bz = -uz, 0.0, ux
-    s = 1.0 / math.sqrt(bx * bx + by * by + bz * bz)
-    bx, by, bz = bx * s, by * s, bz * s
     B = np.empty((3, 2))
-    B[0, 0], B[1, 0], B[2, 0] = bx, by, bz
-    B[0, 1], B[1, 1], B[2, 1] = uy * bz - uz * by, uz * bx - ux * bz, ux * by - uy * bx
+    B[0, 0], B[1, 0], B[2, 0], B[0, 1], B[1, 1], B[2, 1] = across(g[0] / n, g[1] / n, g[2] / n)
     return B
 
 

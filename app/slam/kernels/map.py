@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from app.slam.kernels.clouds import PRIME_X, PRIME_Y, PRIME_Z
-from app.slam.kernels.small import plane_of
+from app.slam.kernels.small import across, plane_of
 
 
 @njit(cache=True, inline="always")
@@ -258,14 +258,7 @@ def _deviate(xx, xy, xz, yy, yz, zz, scatter, normal, out):
     That covariance is scatter / T, where T is the covariance of the points (xx ... zz) within the plane. The two
     vectors are its Cholesky factor.
     """
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    if abs(nx) < 0.8:
-        ax, ay, az = 0.0, nz, -ny
-    else:
-        ax, ay, az = -nz, 0.0, nx
-    unit = 1.0 / math.sqrt(ax * ax + ay * ay + az * az)
-    ax, ay, az = ax * unit, ay * unit, az * unit
-    bx, by, bz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
+    ax, ay, az, bx, by, bz = across(normal[0], normal[1], normal[2])
     aa = ax * ax * xx + ay * ay * yy + az * az * zz + 2.0 * (ax * ay * xy + ax * az * xz + ay * az * yz)
     bb = bx * bx * xx + by * by * yy + bz * bz * zz + 2.0 * (bx * by * xy + bx * bz * xz + by * bz * yz)
     ab = ax * (bx * xx + by * xy + bz * xz) + ay * (bx * xy + by * yy + bz * yz) + az * (bx * xz + by * yz + bz * zz)

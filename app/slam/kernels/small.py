@@ -20,6 +20,21 @@ def cross(a, b, out):
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
+@njit(cache=True, inline="always")
+def across(x, y, z):
+    """Two unit vectors across a unit vector, a and b = (x, y, z) x a: ax, ay, az, bx, by, bz.
+
+    They are smooth in it except where |x| crosses 0.8.
+    """
+    if abs(x) < 0.8:  # its cross product with an axis well across it
+        ax, ay, az = 0.0, z, -y
+    else:
+        ax, ay, az = -z, 0.0, x
+    s = 1.0 / math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax * s, ay * s, az * s
+    return ax, ay, az, y * az - z * ay, z * ax - x * az, x * ay - y * ax
+
+
 @njit(cache=True)
 def rotation(wx, wy, wz, out):
     """Rodrigues: rotation vector (rad) to the (3, 3) array `out`."""
