@@ -13,12 +13,37 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.slam import lie
+from app.slam import iekf, lie
 from app.slam.imu import DIM, EXT, POSE, Belief, mounting_to_pose
-from app.slam.types import F64, NavState
+from app.slam.types import F64, NavState, Registration
 
 VIEW_M = 5.0
 """After walking this far, the view has changed and new surfaces are mapped: about a room, or from door to door."""
+
+WRONG_SPEED = 0.5
+"""m/s: how far the speed may be off along a direction that scans leave open, as in a dark passage."""
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """How far odometry may be off since the last keyframe, because its speed went wrong while scans showed little.
+
+    A scan that contradicts the prediction reveals that. Where scans held all directions before, only this scan is odd.
+
+    Attributes:
+        open_s: s, for how long scans left a direction open. It fades as fast as it grew.
+        metres: standard deviation, along each axis.
+    """
+
+    open_s: float = 0.0
+    metres: float = 0.0
+
+    def after(self, registration: Registration, seconds: float) -> "Doubt":
+        """After one more scan, which came so long after the last one."""
+        open_s = max(0.0, self.open_s + (seconds if registration.degenerate else -seconds))
+        if registration.surprise > iekf.SURPRISING:  # the speed has been found again
+            return Doubt(0.0, self.metres + WRONG_SPEED * open_s)
+        return Doubt(open_s, self.metres)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from app.slam import channels, coast, ground, iekf, imu, keyframes, pause, start
-from app.slam.certainty import Certainty
+from app.slam import channels, coast, ground, imu, keyframes, pause, start
+from app.slam.certainty import Certainty, Doubt
 from app.slam.clock import ClockOffset
 from app.slam.floor import Floor
 from app.slam.fusion import fuse
@@ -47,7 +47,7 @@ class EngineProgress:
         floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
         lines: estimated errors of the scan lines. clock: estimated offset of the IMU's clock.
         paused: the pause after which there is no keyframe yet; None: there is none.
-        contradicted: whether a scan contradicted the prediction since the last keyframe.
+        doubt: how far odometry may be off since the last keyframe.
     """
 
     frame: int = 0
@@ -60,7 +60,7 @@ class EngineProgress:
     lines: LineErrors = field(default_factory=LineErrors.unknown)
     clock: ClockOffset = field(default_factory=ClockOffset)
     paused: Interruption | None = None
-    contradicted: bool = False
+    doubt: Doubt = field(default_factory=Doubt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +89,6 @@ class _Begun:
     still: ImuSamples | None = None
     waiting: bool = False
     notice: str = ""
-
-
-ASTRAY_M = 2.0
-"""m: standard deviation of odometry's error once a scan has contradicted it, as after a stretch in which scans show
-little: a speed that was wrong by 0.5 m/s for four seconds."""
 
 
 class Engine:
@@ -166,12 +161,12 @@ class Engine:
         watch.lap("insert")
 
         cloud = _kept(fused.points, surface.labels, scan)
-        contradicted = before.contradicted or fused.registration.surprise > iekf.SURPRISING
+        doubt = before.doubt.after(fused.registration, (end_ns - begun.belief.state.stamp_ns) * 1e-9)
         keyframe, certainty = None, before.certainty
         if due:
             certainty = (certainty or Certainty.begin(posterior, refined=p.filter.estimate_extrinsics)).moved(posterior)
             kept = replace(cloud, offsets_ns=cloud.offsets_ns - np.int32(end_ns - scan.stamp_ns))
-            keyframe = self._keyframe(posterior, kept, certainty, paused, astray=contradicted)
+            keyframe = self._keyframe(posterior, kept, certainty, paused, doubt.metres)
         watch.lap("keyframe")
 
         result = StepResult(
@@ -205,7 +200,7 @@ class Engine:
             lines=lines,
             clock=clock,
             paused=paused if settling else None,
-            contradicted=contradicted and keyframe is None,
+            doubt=doubt if keyframe is None else replace(doubt, metres=0.0),
         )
         return result
 
@@ -278,7 +273,7 @@ class Engine:
         self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
 
     def _keyframe(
-        self, belief: Belief, cloud: Cloud, certainty: Certainty, paused: Interruption | None, *, astray: bool
+        self, belief: Belief, cloud: Cloud, certainty: Certainty, paused: Interruption | None, astray: float
     ) -> Keyframe:
         state, covariance = belief.state, certainty.in_map(belief)
         keyframe = Keyframe(
@@ -291,7 +286,7 @@ class Engine:
             cloud=cloud,
             drift=certainty.covariance(belief) - covariance,
             resumed_ns=0 if paused is None else paused.end_ns,
-            astray=ASTRAY_M if astray else 0.0,
+            astray=astray,
         )
         self.keyframes.append(keyframe)
         return keyframe

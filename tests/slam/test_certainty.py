@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from app.slam.certainty import VIEW_M, Certainty
+from app.slam.certainty import VIEW_M, WRONG_SPEED, Certainty, Doubt
 from app.slam.imu import BG, DIM, EXT, EXT_POS, EXT_ROT, POS, POSE, ROT, Belief, mounting_to_pose
 from app.slam.params import Params
 from app.slam.start import standing
-from app.slam.types import ImuSamples
+from app.slam.types import ImuSamples, Registration
 
 
 def belief(x: float = 0.0, yaw: float = 0.0, tilt: float = 0.0, *, exact_mounting: bool = True) -> Belief:
@@ -94,3 +94,27 @@ def test_a_mounting_that_is_learnt_leaves_the_first_pose_as_wrong_as_it_was() ->
     np.testing.assert_allclose(certainty.covariance(Belief(begin.state, P)), own, atol=1e-12)  # both are as wrong
     np.testing.assert_allclose(certainty.in_map(Belief(begin.state, P)), own, atol=1e-12)
     np.testing.assert_allclose(certainty.covariance(end), own + follows @ P[EXT, EXT] @ follows.T, atol=1e-12)
+
+
+def scan(*, surprise: float = 0.0, degenerate: bool = False) -> Registration:
+    return Registration(True, 2, 500, 400, 0.02, np.ones(6), degenerate, surprise=surprise)
+
+
+def test_a_contradiction_tells_of_the_time_in_which_scans_left_a_direction_open() -> None:
+    doubt = Doubt()
+    for _ in range(40):
+        doubt = doubt.after(scan(degenerate=True), 0.1)
+    for _ in range(10):
+        doubt = doubt.after(scan(), 0.1)
+    assert doubt.metres == 0.0
+    doubt = doubt.after(scan(surprise=9.0), 0.1)
+    assert doubt.metres == pytest.approx(WRONG_SPEED * 2.9)
+    assert doubt.after(scan(surprise=9.0), 0.1).metres == pytest.approx(doubt.metres)
+
+
+def test_where_scans_hold_all_directions_a_contradiction_makes_no_doubt_of_the_odometry_before_it() -> None:
+    """Else a corridor that looks the same 12 m farther on passed for the right place."""
+    doubt = Doubt()
+    for _ in range(100):
+        doubt = doubt.after(scan(), 0.1)
+    assert doubt.after(scan(surprise=9.0), 0.1).metres == 0.0
