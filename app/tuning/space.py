@@ -18,7 +18,10 @@ WIDE = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """One parameter that varies. low, high: the ends of a number's range; unused for a switch or a choice."""
+    """One parameter that varies.
+
+    low, high: the ends of a number's range, multiples of the step for a whole number; unused for a switch or a choice.
+    """
 
     leaf: Leaf
     low: float = 0.0
@@ -42,8 +45,11 @@ class Dimension:
         return FloatDistribution(self.low, self.high)
 
     def holds(self, value: Any) -> bool:
-        """Whether the value lies in the range."""
-        return isinstance(self.distribution, CategoricalDistribution) or self.low <= value <= self.high
+        """Whether the value lies in the range and, if it is a whole number, on the parameter's step."""
+        distribution = self.distribution
+        if isinstance(distribution, IntDistribution) and value % distribution.step:
+            return False
+        return isinstance(distribution, CategoricalDistribution) or self.low <= value <= self.high
 
     def rounded(self, value: Any) -> Any:
         """The value on the parameter's own step, so that the same setting is never run twice."""
@@ -60,7 +66,7 @@ class Dimension:
         spread = np.geomspace if getattr(distribution, "log", False) else np.linspace
         values = spread(self.low, self.high, points).tolist()
         if isinstance(distribution, IntDistribution):
-            values = [round(value) for value in values]
+            values = [round(value / distribution.step) * distribution.step for value in values]
         return sorted({self.rounded(value) for value in values})
 
 
@@ -97,8 +103,14 @@ def _dimension(leaf: Leaf, limits: str | None) -> Dimension:
         low, high = (float(end) for end in limits.split(":"))
     except ValueError:
         raise HemislamError(f"`{leaf.path}={limits}` is not a range; write it as {leaf.path}=LEAST:GREATEST.") from None
+    steps = ""
+    if isinstance(leaf.default, int):
+        step = int(leaf.step or 1)
+        low, high = float(np.ceil(low / step)) * step, float(np.floor(high / step)) * step
+        steps = f" in steps of {step}"
     if not leaf.minimum <= low < high <= leaf.maximum:
-        raise HemislamError(f"`{leaf.path}={limits}` is not a range within {leaf.range} {leaf.unit}".rstrip() + ".")
+        within = f"{leaf.range} {leaf.unit}".rstrip()
+        raise HemislamError(f"`{leaf.path}={limits}` is not a range within {within}{steps}.")
     return Dimension(leaf, low, high)
 
 

@@ -130,6 +130,16 @@ def test_the_search_learns_from_the_parameters_as_given() -> None:
     assert len(narrow.trials) == 4, "what is given lies outside the range"
 
 
+def test_whole_numbers_vary_on_their_step_wherever_the_range_and_the_given_value_lie() -> None:
+    (points,) = parse_dimensions("filter.max_points=150:1960")
+    assert (points.low, points.high, points.grid(4)) == (200, 1900, [200, 800, 1300, 1900])
+    for value, learned in ((1000, 1), (1050, 0)):
+        given = Params().with_values({"filter.max_points": value})
+        done, study = search(Bowl(), SearchPlan((points,), (ATE,), Part(), given, trials=4))  # type: ignore[arg-type]
+        assert all(trial.values["filter.max_points"] % 100 == 0 for trial in done[1:])
+        assert len(study.trials) == 4 + learned, "what is given is learned from where it lies on the step"
+
+
 def test_the_part_held_back_is_reached_without_a_start_in_between() -> None:
     rest = Part(30.0, 20.0).next()
     assert rest is not None and (rest.start_s, rest.duration_s) == (50.0, 20.0)
@@ -159,6 +169,9 @@ def test_a_grid_has_at_most_as_many_points_as_trials() -> None:
         ("sensor.translation", "cannot vary"),
         ("ground.alpha=40:10", "not a range"),
         ("ground.alpha=0:1000", "not a range"),
+        ("loops.support=1.2:1.8", "not a range"),
+        ("filter.max_points=110:190", "in steps of 100"),
+        ("filter.max_points=-inf:inf", "not a range"),
         ("ground.alpha=fast", "LEAST:GREATEST"),
         ("loops.enabled=0:1", "no range"),
         ("ground.alpha,ground.alpha", r"^ground\.alpha is named twice"),
