@@ -44,7 +44,7 @@ def read_points(path: Path, thin: float, progress: Callable[[float], None] = lam
             progress(share)
     except OSError as error:
         raise HemislamError(f"The map {path} cannot be read: {error.strerror or error}.") from None
-    except (ValueError, KeyError, IndexError, UnicodeDecodeError, laspy.LaspyException, lazrs.LazrsError) as error:
+    except (ValueError, KeyError, IndexError, laspy.LaspyException, lazrs.LazrsError) as error:
         raise HemislamError(f"The map {path.name} is damaged or of an unknown kind ({error}).") from None
     if not (found := np.concatenate(taken)).size:
         raise HemislamError(f"The map {path.name} holds no points.")
@@ -74,7 +74,7 @@ def _header(file: BinaryIO) -> tuple[str, np.dtype, int]:
     """Byte order ("" for text), type and number of the vertices, which must come first."""
     order, fields, count, elements = "", list[tuple[str, str]](), 0, 0
     for number, line in enumerate(iter(file.readline, b"")):
-        match line.decode("ascii").split():
+        match line.decode("ascii", "replace").split():  # a comment may hold anything
             case ["ply"] if number == 0:
                 pass
             case ["format", kind, _]:

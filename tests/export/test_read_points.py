@@ -25,6 +25,7 @@ FILES = {
     "text": ply("ascii", MIXED, b"".join(b"7 %r %r %r 0.5\n" % tuple(map(float, row)) for row in POINTS)),
     "little": ply("binary_little_endian", MIXED, b"".join(struct.pack("<Bdddf", 7, *row, 0.5) for row in POINTS)),
     "big": ply("binary_big_endian", XYZ, b"".join(struct.pack(">ddd", *row) for row in POINTS)),
+    "comment": ply("binary_little_endian", "comment Größe\n" + XYZ, POINTS.tobytes()),
     "faces": ply("binary_little_endian", XYZ, POINTS.tobytes() + b"\x03" + bytes(12), more=FACES),
 }
 
