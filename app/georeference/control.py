@@ -47,7 +47,7 @@ def align_with_points(
     if len(count) < 3:
         raise HemislamError(_left_open(count))
     there, at = np.array([places[one] for one in names]), np.array([picked[one] for one in names])
-    if not np.isfinite([there, at]).all():
+    if not np.isfinite(there).all():
         raise HemislamError(f"A control point of {control.source} lacks a coordinate; fill it in or remove it.")
     _refuse_line(at[used], count)
     ground = Ground.in_grid(there, name)
@@ -57,12 +57,14 @@ def align_with_points(
 
 
 def read_picks(table: NamedColumns) -> dict[str, F64]:
-    """(3,) m in the map by name. Raises HemislamError: it lacks columns."""
+    """(3,) m in the map by name. Raises HemislamError: it lacks columns, a name or a coordinate, or names one twice."""
     if not table.has(*PICKS):
         raise HemislamError(
             f"{table.source} holds no picked points; its first line must name the columns name, x, y, z."
         )
-    return dict(zip(table.columns["name"], table.numbers("x", "y", "z"), strict=True))
+    names = _names(table)
+    _refuse_gaps(table, "x", "y", "z")
+    return dict(zip(names, table.numbers("x", "y", "z"), strict=True))
 
 
 def _left_open(names: list[str]) -> str:
@@ -97,6 +99,11 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
 def require_sound(table: NamedColumns) -> None:
     """Raises HemislamError unless every row is a control point with a name of its own and all coordinates."""
     columns, _ = _coordinates(table), _names(table)
+    _refuse_gaps(table, *columns)
+
+
+def _refuse_gaps(table: NamedColumns, *columns: str) -> None:
+    """Raises HemislamError unless every row has a number in each of these columns."""
     for row, place in enumerate(table.numbers(*columns), 1):
         for column, number in zip(columns, place.tolist(), strict=True):
             if not np.isfinite(number):

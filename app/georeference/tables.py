@@ -80,14 +80,19 @@ def table_of(lines: Sequence[str], source: str, *wanted: str) -> NamedColumns:
         source: as errors name it. wanted: what columns are asked for, where a heading may mean several things.
 
     Raises:
-        HemislamError: it has no heading, or a row is cut.
+        HemislamError: it has no heading, a quotation mark is not closed, or a row is cut.
     """
     rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
         raise HemislamError(f"{source} is empty.")
     separator = next((one for one in ",;\t" if one in rows[0]), None)
     if separator:
-        cells = [[cell.strip() for cell in row] for row in csv.reader(rows, delimiter=separator)]
+        try:
+            cells = [[cell.strip() for cell in row] for row in csv.reader(rows, delimiter=separator)]
+        except csv.Error as error:
+            raise HemislamError(
+                f"{source} is not a table ({error}); look for a quotation mark without its pair."
+            ) from None
     else:
         cells = [row.split() for row in rows]
     titles = [_plain(title) for title in cells[0]]
@@ -116,7 +121,7 @@ def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
     """
     text = read_text(path, "give NMEA or CSV", errors="replace")  # a log may hold binary messages beside the sentences
     lines = text.splitlines()
-    if any(line.lstrip().startswith("$G") for line in lines[:50]):
+    if any(re.search(r"\$G\w{4},", line) for line in lines[:50]):  # loggers write times before it
         fixes, ellipsoidal = nmea.read(lines, str(path), near_ns)
         return fixes.sound(str(path)), ELLIPSOIDAL if ellipsoidal else GEOID
     table = read_table(path, "time", "latitude", "longitude", "height")
@@ -141,14 +146,14 @@ def _stamp(table: NamedColumns, word: str) -> int:
     """Unix seconds with any number of digits, or ISO 8601 (UTC unless it says otherwise), as ns."""
     try:
         return _nanoseconds(word)
-    except (ValueError, OverflowError):
+    except (ValueError, ArithmeticError):
         raise HemislamError(
             f"{table.source}: the time `{word[:40]}` is neither Unix seconds nor a date such as 2026-05-01T10:00:00Z."
         ) from None
 
 
 def _nanoseconds(word: str) -> int:
-    """Raises ValueError or OverflowError: it is no time, or none within 292 years of 1970."""
+    """Raises ValueError or ArithmeticError: it is no time, or none within 292 years of 1970."""
     try:
         return int(np.int64(int(Decimal(word).scaleb(9).to_integral_value())))
     except InvalidOperation:

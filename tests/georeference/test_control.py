@@ -99,6 +99,17 @@ def test_a_point_that_is_given_twice_is_named(tmp_path: Path) -> None:
         laid(control, picks, grid="EPSG:32632")
 
 
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [("A,1,2,3", "picks.csv holds control point A more than once"), ("E,1,,3", "picks.csv, row 5: the y is missing")],
+)
+def test_a_pick_that_is_there_twice_or_cut_is_named_with_its_own_file(tmp_path: Path, row: str, words: str) -> None:
+    control, picks = written(tmp_path, CORNERS)
+    picks.write_text(picks.read_text() + row)
+    with pytest.raises(HemislamError, match=words):
+        laid(control, picks, grid="EPSG:32632")
+
+
 def test_places_on_one_line_are_refused_wherever_their_points_were_picked(tmp_path: Path) -> None:
     _, picks = written(tmp_path, CORNERS)
     control, _ = written(tmp_path, {name: (10.0 * k, 3.0 * k, 0.0) for k, name in enumerate(CORNERS)}, noise=0.0)

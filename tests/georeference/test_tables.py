@@ -60,6 +60,8 @@ def test_a_log_of_a_receiver_is_recognised_by_its_sentences(tmp_path: Path) -> N
     assert len(read_fixes(path, NEAR_NS)[0]) == 3
     path = written(tmp_path, "".join(f"{text}*{checksum(text)}\n" for text in (x.replace("46.9", "") for x in lines)))
     assert read_fixes(path, NEAR_NS)[1] == GEOID
+    path = written(tmp_path, "".join(f"2023-11-14 22:13:20.5 {text}*{checksum(text)}\n" for text in lines))
+    assert read_fixes(path, NEAR_NS)[0].stamps_ns[0] == NEAR_NS, "a logger's own times stand before the sentences"
 
 
 def checksum(sentence: str) -> str:
@@ -80,6 +82,8 @@ def checksum(sentence: str) -> str:
         ("time,lat,lon,height\n" + "1700000000000,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "nan,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "inf,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("time,lat,lon,height\n" + "1e999999,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ('time,lat,"lon,height\n' + "1,48,11,5\n" * 20_000, "a quotation mark without its pair"),
         ("time,lat,lon,height\n" + ",48,11,5\n" * 3, "the time `` is neither Unix seconds nor a date"),
         ("tow,lat,lon,height\n", "holds 0 fixes"),
         ("tow,lat,lon,height\n1,48,11,5\n,48,11,5\n", "row 2: the time `` is not in GPS seconds"),
