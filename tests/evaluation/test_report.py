@@ -188,6 +188,12 @@ def test_a_curve_below_another_shows_beside_it() -> None:
     assert widths == sorted(widths, reverse=True) and widths[0] > widths[1] + 1 > widths[2] + 2
 
 
+def test_the_axes_of_a_map_in_a_grid_show_every_metre() -> None:
+    east, north = 691_607 + np.arange(4.0), 5_412_341 + np.arange(4.0)
+    texts = re.findall(r">([\d.e+]+)</text>", chart([Line("walk", "red", east, north)], "x (m)", "y (m)"))
+    assert {"691608", "691608.5", "5412342", "5412343"} <= set(texts)
+
+
 def test_every_parameter_and_the_machine_stand_in_the_report(folder: Path) -> None:
     """Where the variants differ, each value is told with whose it is."""
     page = (folder / "report.md").read_text()
