@@ -92,22 +92,13 @@ def chart(
         chosen = np.unique(np.r_[np.arange(0, len(line.x), step), len(line.x) - 1])
         points = zip(at_x(line.x[chosen]), at_y(line.y[chosen]), strict=True)
         drawn.append((line, " ".join(f"{x:g},{y:g}" for x, y in points)))
-    xs, ys = _ticks(x0, x1, 7), _ticks(y0, y1, 5)
-    return Markup(
-        render(
-            "chart.svg",
-            width=_WIDTH,
-            height=height,
-            left=_LEFT,
-            right=right,
-            top=_TOP,
-            bottom=bottom,
-            x_ticks=[(float(at_x(x)), f"{x:.12g}") for x in xs],
-            y_ticks=[(float(at_y(y)), f"{y:.12g}") for y in ys],
-            lines=drawn,
-            x_label=x_label,
-            y_label=y_label,
-        )
+    return _axes(
+        "chart.svg",
+        height,
+        (x_label, y_label),
+        x_ticks=[(float(at_x(x)), f"{x:.12g}") for x in _ticks(x0, x1, 7)],
+        y_ticks=[(float(at_y(y)), f"{y:.12g}") for y in _ticks(y0, y1, 5)],
+        lines=drawn,
     )
 
 
@@ -168,13 +159,8 @@ def bodies(groups: Sequence[tuple[str, Sequence[Body]]], x_label: str, y_label: 
     steps = [tick for tick in ticks if low <= np.log10(tick) <= high]
     if len(steps) > 9:
         steps = [tick for tick in steps if f"{tick:e}".startswith("1")]
-    return Markup(
-        render(
-            "bodies.svg", width=_WIDTH, height=height, left=_LEFT, right=right, top=_TOP, bottom=bottom, bodies=drawn,
-            y_ticks=[(float(at_y(tick)), f"{tick:g}") for tick in steps], labels=labels, x_label=x_label,
-            y_label=y_label,
-        )
-    )  # fmt: skip
+    y_ticks = [(float(at_y(tick)), f"{tick:g}") for tick in steps]
+    return _axes("bodies.svg", height, (x_label, y_label), x_ticks=[], y_ticks=y_ticks, labels=labels, bodies=drawn)
 
 
 def stacked(rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], unit: str) -> Markup:
@@ -203,6 +189,13 @@ def density_image(counts: U16, densest: float) -> str:
     file = io.BytesIO()
     image.save(file, "PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _axes(template: str, height: int, titles: tuple[str, str], **drawn: Any) -> Markup:
+    """A chart between two axes; titles: of x and y."""
+    frame = {"width": _WIDTH, "height": height, "left": _LEFT, "right": _WIDTH - _RIGHT, "top": _TOP}
+    x_label, y_label = titles
+    return Markup(render(template, **frame, bottom=height - _BOTTOM, x_label=x_label, y_label=y_label, **drawn))
 
 
 def _range(values: Iterable[F64], *, from_zero: bool = False) -> tuple[float, float]:
@@ -234,7 +227,7 @@ CROP_NOTE = (
 class Figure:
     picture: Markup
     caption: str
-    legend: Legend
+    legend: Legend | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,8 +270,8 @@ def _paths(recording: Evaluated, colour: dict[str, str]) -> list[Figure]:
         for axis in (1, 2)
     )
     return [
-        Figure(chart(above, "x (m)", "y (m)", equal=True, height=420), "From above", []),
-        Figure(chart(side, "x (m)", "z (m)", height=200), "From the side, heights enlarged", []),
+        Figure(chart(above, "x (m)", "y (m)", equal=True, height=420), "From above"),
+        Figure(chart(side, "x (m)", "z (m)", height=200), "From the side, heights enlarged"),
     ]
 
 
@@ -290,7 +283,7 @@ def _errors(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:
     of_time = [Line(name, shade, accuracy.times_s, accuracy.errors_m) for name, shade, accuracy in known]
     of_way = [Line(name, shade, accuracy.walked_m, accuracy.errors_m) for name, shade, accuracy in known]
     figures = [
-        Figure(chart(lines, label, "position error (m)", from_zero=True), f"Position error over {what}", [])
+        Figure(chart(lines, label, "position error (m)", from_zero=True), f"Position error over {what}")
         for lines, label, what in (
             (of_time, "time (s)", "time, after the alignment"),
             (of_way, "true path (m)", "distance, after the alignment"),
@@ -303,7 +296,7 @@ def _errors(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:
     ]
     if groups:
         caption = "Drift over pieces of the path: quartiles, and a line from 5 to 95 %"
-        figures.append(Figure(bodies(groups, "length of the piece", "wrong by (% of it)"), caption, []))
+        figures.append(Figure(bodies(groups, "length of the piece", "wrong by (% of it)"), caption))
     return figures
 
 
@@ -312,7 +305,7 @@ def _times(outcomes: list[Outcome], colour: dict[str, str]) -> list[Figure]:
     if not timed:
         return []
     groups = [("", [violin(name, colour[name], times[:, -1]) for name, times in timed.items()])]
-    figures = [Figure(bodies(groups, "", "time per frame (ms)"), "Time per frame", [])]
+    figures = [Figure(bodies(groups, "", "time per frame (ms)"), "Time per frame")]
     staged = [outcome.name for outcome in outcomes if outcome.staged and outcome.name in timed]
     if staged:
         bars = [(name, timed[name][:, : len(STAGES)].mean(axis=0).tolist()) for name in staged]
