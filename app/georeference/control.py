@@ -52,8 +52,14 @@ def align_with_points(
     _refuse_line(at[used], count)
     ground = Ground.in_grid(there, name)
     _refuse_line(ground.places[used], count)
-    _refuse_mirrored(at[used], ground, used, degrees=not control.has("east"))
-    return _fitted(at, ground, tuple(names), used, height)
+    found = _fitted(at, ground, tuple(names), used, height)
+    if found.reference.rotation[2][2] <= 0:
+        cause = "easting and northing" if control.has("east") else "latitude and longitude"
+        raise HemislamError(
+            f"The control points fit only a map that is upside down: {cause} seem to be swapped, or names exchanged;"
+            " check both tables."
+        )
+    return found
 
 
 def read_picks(table: NamedColumns) -> dict[str, F64]:
@@ -143,21 +149,6 @@ def _refuse_line(points: F64, names: list[str]) -> None:
             f"The control points {', '.join(names)} lie on one line, so the map can still rotate about it;"
             " pick another one off this line."
         )
-
-
-def _refuse_mirrored(points: F64, ground: Ground, used: Mask, *, degrees: bool) -> None:
-    """Raises HemislamError if the places fit these points of the map only with the map upside down.
-
-    Args:
-        degrees: the places were given as latitude and longitude.
-    """
-    if umeyama(points, ground.places[used])[2, 2] > 0:
-        return
-    cause = "latitude and longitude" if degrees else "easting and northing"
-    raise HemislamError(
-        f"The control points fit only a map that is upside down: {cause} seem to be swapped, or names exchanged;"
-        " check both tables."
-    )
 
 
 def _fitted(points: F64, ground: Ground, names: tuple[str, ...], used: Mask, height: str) -> Alignment:
