@@ -22,12 +22,7 @@ def projected(name: str) -> "pyproj.CRS":
     Raises:
         HemislamError: there is none, or it is not a plane grid in metres.
     """
-    import pyproj
-
-    try:
-        crs = pyproj.CRS.from_user_input(name)
-    except pyproj.exceptions.CRSError:
-        raise HemislamError(f"{name} names no coordinate system; give one as EPSG:32632.") from None
+    crs = _system(name, "give one as EPSG:32632")
     if not crs.is_projected:
         raise HemislamError(f"{name} ({crs.name}) is not a plane grid; give a projected one such as EPSG:32632.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info):
@@ -50,16 +45,21 @@ def vertical(height: str) -> "pyproj.CRS | None":
     """
     if not height.upper().startswith("EPSG:"):
         return None
-    import pyproj
-
-    try:
-        crs = pyproj.CRS.from_user_input(height)
-    except pyproj.exceptions.CRSError:
-        raise HemislamError(f"{height} names no coordinate system; give one of heights as EPSG:3855.") from None
+    crs = _system(height, "give one of heights as EPSG:3855")
     up = crs.is_vertical and crs.axis_info[0].direction == "up" and crs.axis_info[0].unit_conversion_factor == 1.0
     if not up or crs.is_compound:
         raise HemislamError(f"{height} ({crs.name}) is not one of heights in metres; give one such as EPSG:3855.")
     return crs
+
+
+def _system(name: str, advice: str) -> "pyproj.CRS":
+    """Raises HemislamError: there is none of this name; `advice` says what to give."""
+    import pyproj
+
+    try:
+        return pyproj.CRS.from_user_input(name)
+    except pyproj.exceptions.CRSError:
+        raise HemislamError(f"{name} names no coordinate system; {advice}.") from None
 
 
 def wkt1(name: str, height: str) -> str:
