@@ -1,6 +1,5 @@
 """`hemislam georeference`: where on Earth a map lies."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -78,6 +77,7 @@ def georeference(
       hemislam georeference runs/walk-1 --factors --out runs/walk-1-bent
       hemislam georeference runs/walk-1 --control points.csv --picks picked.csv --crs EPSG:25832
     """
+    from app.export.folder import recording_of
     from app.georeference import ledger
     from app.georeference.align import align
     from app.georeference.control import CONTROL, PICKS, align_with_points, read_picks
@@ -99,7 +99,11 @@ def georeference(
         found = align_with_points(read_table(control, *CONTROL), picked, grid=crs, height=height or "ellipsoidal")
         lines = [*ledger.summary(found, "control points"), "", *ledger.table(found)]
     else:
-        recording = results if gnss is not None else _recording_of(results)
+        recording = results if gnss is not None else recording_of(results)
+        if recording is None:
+            raise HemislamError(
+                f"{results} has no report.json that names its recording; give the fixes with --gnss FILE."
+            )
         fixes, heights = fixes_of(recording, gnss, int(trajectory.stamps_ns[0]))
         overridden = {str(fix): fix in (accept or []) for fix in (*(accept or []), *(reject or []))}
         found = align(trajectory, fixes, grid=crs, height=height or heights, lever=lever_arm, overridden=overridden)
@@ -132,16 +136,6 @@ def _bent(
     for other in set(BY_RUN) - set(files):
         (out / other.name).unlink(missing_ok=True)
     return after.found, after.trajectory
-
-
-def _recording_of(results: Path) -> Path:
-    """That the results were made of."""
-    try:
-        return Path(json.loads((results / "report.json").read_text(encoding="utf-8"))["recording"]["path"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise HemislamError(
-            f"{results} has no report.json that names its recording; give the fixes with --gnss FILE."
-        ) from None
 
 
 def _write(results: Path, found: "Alignment", trajectory: "Trajectory") -> None:

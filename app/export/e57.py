@@ -10,9 +10,10 @@ import pye57
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
-from app.export.points import GPS_MINUS_UNIX_S, Block
+from app.export.points import Block
 from app.export.results import Results
 from app.georeference.reference import GeoReference
+from app.georeference.tables import GPS_MINUS_UNIX_S
 
 
 def write(path: Path, results: Results) -> None:

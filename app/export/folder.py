@@ -31,13 +31,17 @@ def read_results(folder: Path) -> Results:
     rows = zip(trajectory.stamps_ns.tolist(), trajectory.positions, trajectory.quaternions, strict=True)
     log = RunLog([Frame(stamp_ns, False, position, quaternion, nothing) for stamp_ns, position, quaternion in rows])
     try:
-        recording = Path(json.loads((folder / "report.json").read_bytes())["recording"]["path"])
-    except (OSError, ValueError, KeyError, TypeError):
-        recording = folder
-    try:
         g2o = graph.read_text(encoding="utf-8") if graph.exists() else None
     except (OSError, ValueError):
         g2o = None
     loops = LoopResults(MapFrame(), np.empty(0, np.int64), (), g2o) if g2o is not None else None
-    info = RunInfo(recording, Params())
+    info = RunInfo(recording_of(folder) or folder, Params())
     return Results(log, MapFile(folder / "map.ply"), info, loops, where=reference.read(folder))
+
+
+def recording_of(folder: Path) -> Path | None:
+    """The recording that the results in a folder were made of; None if they have no report.json that names it."""
+    try:
+        return Path(json.loads((folder / "report.json").read_bytes())["recording"]["path"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

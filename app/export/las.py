@@ -10,9 +10,10 @@ import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from app import __version__
-from app.export.points import GPS_MINUS_UNIX_S, Block
+from app.export.points import Block
 from app.export.results import Results
 from app.georeference.reference import GeoReference
+from app.georeference.tables import GPS_MINUS_UNIX_S
 from app.slam.types import F64, MOVING
 
 SCALE = 0.001

@@ -17,9 +17,6 @@ from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes
 from app.slam.types import F32, F64, I64, MOVING, U8, U16, Cloud, Keyframe
 
-GPS_MINUS_UNIX_S = -315_964_800 + 18
-"""From Unix to GPS time, with the leap seconds since 2017."""
-
 
 @dataclass(frozen=True, slots=True)
 class Choice:

@@ -17,8 +17,9 @@ from app.slam.errors import HemislamError
 from app.slam.user_text import read_text
 
 GEOID = "orthometric (geoid of the receiver)"
-LEAP_S, WEEK_S, GPS_EPOCH_S = 18, 604_800, 315_964_800
-"""Leap seconds by which GPS time is ahead of UTC since 2017; seconds of a GPS week; when the first week began."""
+GPS_MINUS_UNIX_S = 18 - 315_964_800
+"""From Unix to GPS time: the leap seconds since 2017, and when the first GPS week began."""
+WEEK_S = 604_800
 MOST_S = 4e9
 """More seconds are milliseconds."""
 
@@ -172,7 +173,7 @@ def _of_week(table: NamedColumns, near_ns: int) -> list[int]:
         row = int(np.argmax(wrong))
         word = table.columns["week_s"][row][:40]
         raise HemislamError(f"{table.source}, row {row + 1}: the time `{word}` is not in GPS seconds.")
-    now = near_ns * 1e-9 - GPS_EPOCH_S + LEAP_S
+    now = near_ns * 1e-9 + GPS_MINUS_UNIX_S
     weeks = round((now - float(seconds[0])) / WEEK_S)
-    start = (weeks * WEEK_S + GPS_EPOCH_S - LEAP_S) * 1_000_000_000
+    start = (weeks * WEEK_S - GPS_MINUS_UNIX_S) * 1_000_000_000
     return [start + round(value * 1e9) for value in seconds.tolist()]
