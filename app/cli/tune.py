@@ -19,7 +19,6 @@ from app.cli.evaluate import (
 )
 from app.cli.options import Duration, ParamsFor, with_params
 from app.slam.errors import HemislamError
-from app.slam.provenance import cores
 from app.slam.text_files import make_folder
 
 
@@ -104,7 +103,7 @@ def tune(
     from app.tuning.report import BEST
     from app.tuning.space import parse_dimensions
     from app.tuning.trial import Trial, advice, front
-    from app.tuning.tune import Part, Runs, SearchPlan
+    from app.tuning.tune import Part, Runs, SearchPlan, parallel_runs
     from app.tuning.tune import tune as find
 
     dimensions = parse_dimensions(parameters)
@@ -121,11 +120,10 @@ def tune(
     wanted = choose_objectives(objectives or [usual], subjects)
     if held_back and duration is None:
         raise HemislamError("--held-back needs --duration: without it the search sees the whole recording.")
-    timed = any(one.name == "frame-time" for one in wanted)  # runs beside each other would spoil it
     part = Part(start, duration)
     rest = part.next(held_back) if held_back != 0 and not marks else None
     make_folder(out)
-    run = runner(jobs or (1 if timed else cores()), cluster, cluster_data, quiet=True)
+    run = runner(jobs or parallel_runs(wanted), cluster, cluster_data, quiet=True)
     runs = Runs(subjects, wanted, out, run)
     compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:

@@ -96,12 +96,18 @@ class Job:
 
 def finished(job: Job) -> dict[str, Any] | None:
     """What run.json holds, if the job was run to its end with just these inputs."""
+    report = read_run(job.folder)
+    return report if report is not None and report.get("key") == job.key else None
+
+
+def read_run(folder: Path) -> dict[str, Any] | None:
+    """What run.json of a run's folder holds; None if it cannot be read or a file of the run is missing."""
     try:
-        report: dict[str, Any] = json.loads((job.folder / "run.json").read_text(encoding="utf-8"))
+        report = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    whole = all((job.folder / name).is_file() for name in RUN_FILES)
-    return report if whole and report.get("key") == job.key else None
+    whole = all((folder / name).is_file() for name in RUN_FILES)
+    return report if whole and isinstance(report, dict) else None
 
 
 @contextmanager

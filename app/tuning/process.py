@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from app.child import Link
 from app.slam.params import Params
-from app.slam.provenance import cores
 from app.tuning.trial import SearchMethod, Trial, front
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def find(owner: Link, wanted: Wanted) -> None:
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import importances
     from app.tuning.space import parse_dimensions
-    from app.tuning.tune import Part, Runs, SearchPlan, tune
+    from app.tuning.tune import Part, Runs, SearchPlan, parallel_runs, tune
 
     truth = read_truth(str(wanted.truth)) if wanted.truth is not None else None
     subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
@@ -94,8 +93,7 @@ def find(owner: Link, wanted: Wanted) -> None:
         latest = Tried(tuple(so_far), best, importances(study, 0, objectives[0]))
         owner.send(latest)
 
-    parallel = 1 if "frame-time" in wanted.objectives else cores()  # runs beside each other would spoil their times
-    run = partial(run_jobs, parallel=parallel, quiet=True, ended=ended)
+    run = partial(run_jobs, parallel=parallel_runs(objectives), quiet=True, ended=ended)
     runs = Runs([subject], objectives, wanted.folder, run)
     _, checked = tune(runs, search, wanted.folder, progress)
     owner.send(replace(latest, held_back=checked, finished=True))

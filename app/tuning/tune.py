@@ -4,19 +4,19 @@ Nothing but finished runs is kept. The same search asks for the same settings in
 of processes, so one that was interrupted finds its finished runs and goes on where it was.
 """
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import optuna
 
 from app.evaluation.evaluate import Subject, check_subject
-from app.evaluation.job import LEAD_S, RUN_FILES, Job
+from app.evaluation.job import LEAD_S, Job, read_run
 from app.evaluation.measured import load, measure
 from app.evaluation.runner import RunJobs
 from app.slam.params import Params
+from app.slam.provenance import cores
 from app.tuning.objectives import Objective, score
 from app.tuning.report import write_results
 from app.tuning.space import Dimension, grid
@@ -109,23 +109,20 @@ class Runs:
 
     def _job(self, index: int, values: Mapping[str, Any], part: Part) -> Job:
         subject = self._subjects[index]
-
-        def made(folder: Path, variant: str) -> Job:
-            return Job(
-                recording=subject.recording,
-                sha256=self.hashes[index],
-                name=subject.name,
-                variant=variant,
-                params=subject.params.with_values(values),
-                folder=folder,
-                start_s=part.start_s,
-                duration_s=part.duration_s,
-                lead_s=part.lead_s,
-                marks=subject.marks,
-            )
-
-        key = made(self._folder, "").key
-        return made(self._known.get(key, self._folder / subject.name / key[:16]), key[:16])
+        job = Job(
+            recording=subject.recording,
+            sha256=self.hashes[index],
+            name=subject.name,
+            variant="",
+            params=subject.params.with_values(values),
+            folder=self._folder,
+            start_s=part.start_s,
+            duration_s=part.duration_s,
+            lead_s=part.lead_s,
+            marks=subject.marks,
+        )
+        name = job.key[:16]
+        return replace(job, variant=name, folder=self._known.get(job.key, self._folder / subject.name / name))
 
     def _scored(
         self, jobs: Sequence[Job], errors: Mapping[tuple[str, str], str]
@@ -137,6 +134,11 @@ class Runs:
             measure([load(job, "")], subject.truth)[0][0] for job, subject in zip(jobs, self._subjects, strict=True)
         ]
         return tuple(score(objective, outcomes) for objective in self._objectives), ""
+
+
+def parallel_runs(objectives: Sequence[Objective]) -> int:
+    """How many runs go on at once: one for each core, but one alone where its time is wanted."""
+    return 1 if any(one.name == "frame-time" for one in objectives) else cores()
 
 
 OnTrials = Callable[[Sequence[Trial], optuna.Study], None]
@@ -228,12 +230,5 @@ def _sampler(how: SearchMethod, seed: int) -> optuna.samplers.BaseSampler:
 
 def _known_runs(folder: Path) -> dict[str, Path]:
     """Folders of finished runs below `folder`, by their key, so that `tune` runs nothing that `evaluate` ran."""
-    known = {}
-    for report in sorted(folder.glob("*/runs/*/*/run.json")):
-        try:
-            key = json.loads(report.read_text(encoding="utf-8"))["key"]
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        if all((report.parent / name).is_file() for name in RUN_FILES):
-            known[str(key)] = report.parent
-    return known
+    runs = [(path.parent, read_run(path.parent)) for path in sorted(folder.glob("*/runs/*/*/run.json"))]
+    return {str(run.get("key")): where for where, run in runs if run is not None}
