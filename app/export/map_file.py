@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from app.export.points import Block, as_cloud
+from app.export.points import Block
 from app.slam.errors import HemislamError
 from app.slam.ply import header
-from app.slam.types import GROUND, MOVING, NON_GROUND, Keyframe, is_ground
+from app.slam.types import GROUND, MOVING, NON_GROUND, Cloud, Keyframe, is_ground
 
 VERTEX = np.dtype(
     [
@@ -104,17 +104,14 @@ class MapFile:
         T[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
         T[:3, 3] = row["x"], row["y"], row["z"]
         stamp_ns = int(row["seconds"]) * 1_000_000_000 + int(row["nanoseconds"])
-        offsets_ns = np.rint((vertices["time"] - row["seconds"]) * 1e9 - row["nanoseconds"]).astype(np.int64)
-        block = Block(
-            index,
-            stamp_ns,
-            T,
-            np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=1).astype(np.float64),
-            stamp_ns + offsets_ns,
-            np.where(vertices["moving"] > 0, MOVING, np.where(vertices["ground"] > 0, GROUND, NON_GROUND)).astype(
-                np.uint8
-            ),
+        offsets_ns = np.rint((vertices["time"] - row["seconds"]) * 1e9 - row["nanoseconds"])
+        points = np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=1).astype(np.float64)
+        labels = np.where(vertices["moving"] > 0, MOVING, np.where(vertices["ground"] > 0, GROUND, NON_GROUND))
+        cloud = Cloud(
+            ((points - T[:3, 3]) @ T[:3, :3]).astype(np.float32),
+            labels.astype(np.uint8),
             vertices["intensity"],
             vertices["ring"],
+            np.minimum(offsets_ns, 0).astype(np.int32),
         )
-        return Keyframe(index, index, stamp_ns, T, np.eye(4), np.eye(6), as_cloud(block))
+        return Keyframe(index, index, stamp_ns, T, np.eye(4), np.eye(6), cloud)

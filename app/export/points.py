@@ -15,7 +15,7 @@ from app.slam.errors import HemislamError
 from app.slam.kernels.clouds import first_in_voxels, transform
 from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes
-from app.slam.types import F32, F64, I64, MOVING, U8, U16, Cloud, Keyframe
+from app.slam.types import F32, F64, I64, MOVING, U8, U16, Keyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +95,6 @@ def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
     begin_ns = keyframe.stamp_ns - int(cloud.offsets_ns.max(initial=0))
     stamps_ns = begin_ns + cloud.offsets_ns.astype(np.int64)
     return Block(keyframe.index, keyframe.stamp_ns, T, points, stamps_ns, cloud.labels, cloud.intensity, cloud.ring)
-
-
-def as_cloud(block: Block) -> Cloud:
-    """The points in the LiDAR frame again; offsets count from the scan's end, for its begin may not be in the map."""
-    T, stamps_ns = block.T_map_lidar, block.stamps_ns
-    points = ((block.points - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
-    offsets_ns = np.minimum(stamps_ns - block.stamp_ns, 0).astype(np.int32)
-    return Cloud(points, block.labels, block.intensity, block.ring, offsets_ns)
 
 
 class Voxels:
