@@ -6,6 +6,8 @@ from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
 
+import numpy as np
+
 from app.georeference.fixes import Fixes
 from app.slam.errors import HemislamError
 
@@ -14,20 +16,21 @@ _NOBODY = (float("nan"),) * 3
 
 
 @dataclass(slots=True)
-class Sentences:
-    """Collects sentences, in the order of the receiver.
+class _Log:
+    """What the sentences of a receiver say, in its order.
 
     Attributes:
         near_ns: a time within half a day, for sentences before the first one with a date.
-        separated: whether every place came with the geoid's height, so that heights are above the ellipsoid.
+        places: latitude and longitude in degrees, height above the geoid and the geoid's above the ellipsoid (nan if
+            not told), m. stamps, at: of each place, in ns and in s of the day.
+        sigmas: m to the east, north and up by s of the day.
     """
 
     near_ns: int
-    separated: bool = True
-    _places: list[tuple[float, float, float]] = field(default_factory=list)
-    _stamps: list[int] = field(default_factory=list)
-    _at: list[float] = field(default_factory=list)  # s of the day
-    _sigmas: dict[float, tuple[float, float, float]] = field(default_factory=dict)
+    places: list[tuple[float, float, float, float]] = field(default_factory=list)
+    stamps: list[int] = field(default_factory=list)
+    at: list[float] = field(default_factory=list)
+    sigmas: dict[float, tuple[float, float, float]] = field(default_factory=dict)
 
     def add(self, line: str) -> None:
         """One line; anything but a whole sentence with the right checksum is ignored."""
@@ -40,7 +43,7 @@ class Sentences:
                 self._place(words)
             elif kind.endswith("GST") and len(words) > 7 and words[5]:
                 north, east, up = (float(word) for word in words[5:8])
-                self._sigmas[_seconds(words[0])] = east, north, up
+                self.sigmas[_seconds(words[0])] = east, north, up
             elif kind.endswith("RMC") and len(words) > 8 and words[1] == "A" and words[8]:
                 self._day(datetime.strptime(words[8], "%d%m%y"), words[0])
             elif kind.endswith("ZDA") and len(words) > 3 and words[3]:
@@ -48,27 +51,20 @@ class Sentences:
         except ValueError:
             return
 
-    def fixes(self) -> Fixes:
-        """All so far."""
-        sigmas = [self._sigmas.get(at, _NOBODY) for at in self._at]
-        return Fixes.of(self._stamps, self._places, sigmas)
-
     def _place(self, words: list[str]) -> None:
         latitude, longitude = _degrees(words[1], words[2]), _degrees(words[3], words[4])
-        height, separation = float(words[8]), words[10]
-        self.separated = self.separated and bool(separation)
         at = _seconds(words[0])
-        self._places.append((latitude, longitude, height + float(separation or 0.0)))
-        self._stamps.append(_nearest(at, self.near_ns))
-        self._at.append(at)
-        self.near_ns = self._stamps[-1]
+        self.places.append((latitude, longitude, float(words[8]), float(words[10] or "nan")))
+        self.stamps.append(_nearest(at, self.near_ns))
+        self.at.append(at)
+        self.near_ns = self.stamps[-1]
 
     def _day(self, day: datetime, time: str) -> None:
         at = round(_seconds(time) * 1e9)
         stamp_ns = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + at
         off = round((stamp_ns - _nearest(at * 1e-9, self.near_ns)) / (_DAY_S * 1e9)) * round(_DAY_S * 1e9)
         if off:  # the day was guessed so far
-            self._stamps = [stamp + off for stamp in self._stamps]
+            self.stamps = [stamp + off for stamp in self.stamps]
         self.near_ns = stamp_ns
 
 
@@ -78,13 +74,15 @@ def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
     Raises:
         HemislamError: naming `source`: there is no GGA sentence with a place.
     """
-    sentences = Sentences(near_ns)
+    log = _Log(near_ns)
     for line in lines:
-        sentences.add(line)
-    fixes = sentences.fixes()
-    if not len(fixes):
+        log.add(line)
+    if not log.places:
         raise HemislamError(f"{source} holds no NMEA sentence GGA with a position; switch it on in the receiver.")
-    return fixes, sentences.separated
+    *place, height, separation = np.array(log.places).T
+    ellipsoidal = bool(np.isfinite(separation).all())  # if it is missing once, all heights are left above the geoid
+    places = np.column_stack([*place, height + separation if ellipsoidal else height])
+    return Fixes.of(log.stamps, places, [log.sigmas.get(at, _NOBODY) for at in log.at]), ellipsoidal
 
 
 def _degrees(text: str, side: str) -> float:

@@ -45,6 +45,13 @@ def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
     assert fixes.sigmas[0].tolist() == [0.020, 0.023, 0.031]  # GST names north first
 
 
+def test_heights_of_one_log_are_all_above_the_same_surface() -> None:
+    """A receiver that leaves the geoid's height out once would lift this fix by 47 m off its neighbours."""
+    without = "$GPGGA,123520,4807.038,N,01131.000,E,1,08,0.9,545.4,M,,M,,*58"
+    fixes, ellipsoidal = nmea.read([GGA, without, GGA], "log", 0)
+    assert fixes.height.tolist() == [545.4] * 3 and not ellipsoidal
+
+
 @pytest.mark.parametrize("line", [GGA[:-1] + "8", GGA.replace(",1,08", ",0,08"), GGA[:30], "noise", ""])
 def test_a_wrong_checksum_a_cut_line_or_no_fix_give_nothing(line: str) -> None:
     with pytest.raises(HemislamError, match="no NMEA sentence GGA"):
