@@ -182,7 +182,8 @@ def _write(
             allow_pickle=False,
             **{place: crops.crop(part_of_map(), poses, centre) for place, centre in centres.items()},
         )
-        (part / "run.json").write_text(json.dumps(facts, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        text = json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
+        (part / "run.json").write_text(text, encoding="utf-8", errors="backslashreplace")  # a path need not be UTF-8
 
 
 def _score_ground(scores: list[GroundScore], result: StepResult, marks: dict[int, bytes]) -> None:

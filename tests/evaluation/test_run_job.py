@@ -43,3 +43,12 @@ def test_a_part_in_the_middle_is_entered_early_and_only_it_counts(recording: Pat
         assert np.loadtxt(part.folder / "timings.csv", delimiter=",", skiprows=1).shape[0] == len(later)
     with pytest.raises(HemislamError, match="no scan after 4 s"):
         run("late", 4.0)
+
+
+def test_a_recording_whose_name_is_not_utf_8_is_run_to_its_end(recording: Path, tmp_path: Path) -> None:
+    other = tmp_path / "w\udcfflk.mcap"
+    other.symlink_to(recording)
+    job = Job(other, "x", "walk", "LOAM", Params(), tmp_path / "run", baseline="loam")
+    run_job(job, lambda done, total: None)
+    facts = finished(job)
+    assert facts is not None and facts["recording"] == str(other)
