@@ -29,6 +29,8 @@ REACH_M: Final = 0.5
 """Farther surfaces are not the same one."""
 _FIT_VOXEL_M: Final = 0.2
 _FIT_REACH_M: Final = 2.0
+_FARTHEST_M: Final = 1000.0
+"""Points farther outside the other map lie nowhere near it, and small_gicp warns of each beyond 200 km."""
 _EDGE_M: Final = 0.2
 _BATCH: Final = 10_000
 
@@ -161,14 +163,16 @@ def _keys(points: F32, edge: float) -> I64:
 
 def _fitted(mine: F32, theirs: F32) -> F64:
     """(4, 4), what moves their points onto mine (Segal 2009, generalised ICP)."""
-    found = small_gicp.align(
-        mine.astype(np.float64),
-        theirs.astype(np.float64),
-        registration_type="GICP",
-        downsampling_resolution=_FIT_VOXEL_M,
-        max_correspondence_distance=_FIT_REACH_M,
-        num_threads=1,
-    )
-    if not found.converged or found.num_inliers < 100:
-        raise HemislamError("The maps could not be fitted to each other; they must lie within 2 m and a few degrees.")
-    return np.asarray(found.T_target_source, np.float64)
+    theirs = theirs[(np.abs(theirs) < np.abs(mine).max() + _FARTHEST_M).all(axis=1)]
+    if len(theirs):
+        found = small_gicp.align(
+            mine.astype(np.float64),
+            theirs.astype(np.float64),
+            registration_type="GICP",
+            downsampling_resolution=_FIT_VOXEL_M,
+            max_correspondence_distance=_FIT_REACH_M,
+            num_threads=1,
+        )
+        if found.converged and found.num_inliers >= 100:
+            return np.asarray(found.T_target_source, np.float64)
+    raise HemislamError("The maps could not be fitted to each other; they must lie within 2 m and a few degrees.")

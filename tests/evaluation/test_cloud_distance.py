@@ -83,11 +83,14 @@ def test_a_map_in_another_frame_nearby_is_fitted_first() -> None:
     assert found.typical < 0.002 and np.abs(found.T - T).max() < 3e-3
 
 
-def test_maps_that_do_not_meet_are_refused_in_a_sentence() -> None:
+def test_maps_that_do_not_meet_are_refused_in_a_sentence(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(HemislamError, match="do not lie on each other"):
         from_above(floor(0.0), floor(0.0) + 100.0)
     with pytest.raises(HemislamError, match="could not be fitted"):
         from_above(floor(0.0), floor(0.0) + 100.0, fit=True)
+    with pytest.raises(HemislamError, match="could not be fitted"):
+        from_above(floor(0.0), floor(0.0) + np.array([691_607.0, 5_334_760.0, 520.0]), fit=True)
+    assert "out of range" not in capfd.readouterr().err
     with pytest.raises(HemislamError, match="without points"):
         from_above(floor(0.0), np.empty((0, 3)))
 
