@@ -83,6 +83,8 @@ def export(
     from app.export.points import Choice
 
     exports = of_formats([name.strip() for name in formats.split(",") if name.strip()])
+    if not exports:
+        raise HemislamError("--format names no format; give one or several of the names that --help lists.")
     choice = Choice(thin, _box(box), slab, moving)
     if source.is_dir():
         results, folder = read_results(source), out or source / "export"

@@ -57,6 +57,7 @@ def test_a_session_gives_the_points_of_a_run_to_its_frame(hemislam: Call, walk: 
     ("options", "sentence"),
     [
         (("--format", "dwg"), "There is no format dwg"),
+        (("--format", " , "), "names no format"),
         (("--format", "laz", "--box", "1,2,3"), "--box takes six numbers"),
         (("--format", "gpx"), "needs a georeferenced map"),
     ],
