@@ -95,7 +95,7 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
     """Read a file, or `topic:/name` in the recording; `lever` replaces the lever arm that the format implies.
 
     Raises:
-        HemislamError: it cannot be read, is not what it should be, or jumps.
+        HemislamError: it cannot be read, is not what it should be, or jumps; or the lever arm is not finite.
     """
     if text.startswith("topic:"):
         if recording is None:
@@ -104,6 +104,8 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
     else:
         truth = _read_file(Path(text))
     if lever is not None:
+        if not np.isfinite(lever).all():
+            raise HemislamError(f"A lever arm of {lever} is none; give three numbers of metres.")
         truth = replace(truth, lever=lever)
     check(truth)
     return truth

@@ -103,8 +103,10 @@ def align(
             names count, whatever their residuals.
 
     Raises:
-        HemislamError: the fixes do not fit the trajectory in time or place, or do not determine a heading.
+        HemislamError: fixes do not fit the trajectory in time or place, or determine no heading; `lever` is not finite.
     """
+    if lever is not None and not np.isfinite(lever).all():
+        raise HemislamError(f"A lever arm of {lever} is none; give three numbers of metres.")
     if len(trajectory) < 4:
         raise HemislamError("The trajectory has fewer than 4 poses; that is too few to align it with fixes.")
     path = PathOverTime(trajectory)

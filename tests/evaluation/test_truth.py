@@ -54,6 +54,8 @@ def test_the_gnss_table_is_brought_into_clock_point_and_axes_of_the_imu(gnss: Pa
 
 
 def test_without_its_lever_arm_the_antenna_is_distinguished_from_the_imu(gnss: Path) -> None:
+    with pytest.raises(HemislamError, match="lever arm"):
+        read_truth(str(gnss), lever=(float("inf"), 0.0, 0.0))
     matched = match(read_truth(str(gnss), lever=(0.0, 0.0, 0.0)), ESTIMATE)
     assert 0.1 < ate(ESTIMATE, matched.trajectory).position.max < 0.6  # 0.45 m of arm, turned about
 

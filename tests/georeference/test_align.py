@@ -179,6 +179,12 @@ def test_a_line_at_even_pace_shows_no_offset_and_none_is_made_up() -> None:
     assert not any("Clock offset" in line for line in summary(found, "fixes"))
 
 
+def test_a_lever_arm_that_is_no_number_is_named() -> None:
+    made = walked()
+    with pytest.raises(HemislamError, match="lever arm"):
+        align(made.trajectory, made.fixes, lever=(0.1, float("nan"), 0.0))
+
+
 def test_a_trajectory_of_three_poses_is_refused() -> None:
     made = walked(duration_s=3.0)
     short = Trajectory.from_poses(made.trajectory.stamps_ns[:3], made.trajectory.poses[:3])
