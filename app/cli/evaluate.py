@@ -1,5 +1,6 @@
 """`hemislam evaluate`: the paper's tables, on any recordings."""
 
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,7 +14,9 @@ from app.slam.provenance import cores
 from app.slam.text_files import make_folder
 
 if TYPE_CHECKING:
+    from app.evaluation.evaluate import Subject
     from app.evaluation.runner import RunJobs
+    from app.slam.arrays import Vector
     from app.slam.trajectory import Trajectory
 
 ClusterAddress = Annotated[
@@ -122,9 +125,7 @@ def evaluate(
     """
     from app.cli.run import compile_behind_bar
     from app.cli.suite import make_suite
-    from app.evaluation.evaluate import Subject
     from app.evaluation.evaluate import evaluate as run_evaluation
-    from app.evaluation.truth import read_truth
     from app.evaluation.variants import choose_variants, parse_variant
     from app.sensors.simulator.imperfections import IMPERFECT, NONE
 
@@ -143,13 +144,9 @@ def evaluate(
         )
     if not paths:
         raise HemislamError("Nothing to evaluate; name a RECORDING or use --suite paper.")
-    names = name_recordings(paths)
-    others = _compared(compare or [], names, [variant.name for variant in chosen])
-    arm = _lever(lever)
-    subjects = [
-        Subject(name, path, params_for(path), read_truth(text, path, arm) if text else None, tuple(others[name]))
-        for path, name, text in zip(paths, names, truth_texts(paths, truths or []), strict=True)
-    ]
+    subjects = read_subjects(paths, params_for, truths or [], _lever(lever))
+    others = _compared(compare or [], [subject.name for subject in subjects], [variant.name for variant in chosen])
+    subjects = [replace(subject, compared=tuple(others[subject.name])) for subject in subjects]
     for variant in chosen:
         variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs
     run = runner(max(1, min(jobs or cores(), len(chosen) * len(subjects))), cluster, cluster_data)
@@ -188,29 +185,39 @@ def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False)
     return Cluster(address, url).run_jobs
 
 
-def name_recordings(paths: list[Path]) -> list[str]:
-    """The recordings' names, numbered where two are the same."""
-    names: list[str] = []
-    for path in paths:
-        stem = path.resolve().stem
-        count = sum(name == stem or name.startswith(f"{stem}~") for name in names)
-        names.append(stem if not count else f"{stem}~{count + 1}")
-    return names
+def read_subjects(
+    paths: list[Path], params_for: ParamsFor, truths: list[str], lever: "Vector | None" = None
+) -> "list[Subject]":
+    """The recordings with their parameters and truths, numbered where two have the same name.
 
+    Args:
+        truths: of the first recordings, `none` for none; the others have the one beside them, if there is one.
 
-def truth_texts(paths: list[Path], given: list[str]) -> list[str | None]:
+    Raises:
+        HemislamError: there are more truths than recordings, or one cannot be read.
+    """
+    from app.evaluation.evaluate import Subject
+    from app.evaluation.truth import read_truth
     from app.slam.trajectory import truth_beside
 
-    if len(given) > len(paths):
+    if len(truths) > len(paths):
         raise HemislamError(
-            f"{len(given)} --truth options for {len(paths)} recordings; give at most one for each, in order."
+            f"{len(truths)} --truth options for {len(paths)} recordings; give at most one for each, in order."
         )
-    texts: list[str | None] = [None if text == "none" else text for text in given]
-    beside = [truth_beside(path) for path in paths[len(given) :]]
-    return texts + [str(path) if path else None for path in beside]
+    texts = truths + [str(truth_beside(path) or "none") for path in paths[len(truths) :]]
+    subjects: list[Subject] = []
+    for path, text in zip(paths, texts, strict=True):
+        stem = path.resolve().stem
+        count = sum(one.name == stem or one.name.startswith(f"{stem}~") for one in subjects)
+        name = f"{stem}~{count + 1}" if count else stem
+        params = params_for(path)
+        subjects.append(
+            Subject(name, path, params, read_truth(text, path, lever) if text not in ("", "none") else None)
+        )
+    return subjects
 
 
-def _lever(text: str | None) -> tuple[float, float, float] | None:
+def _lever(text: str | None) -> "Vector | None":
     if text is None:
         return None
     try:

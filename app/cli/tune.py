@@ -1,22 +1,13 @@
 """`hemislam tune`: which parameters fit a sensor and a place."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from app.cli.evaluate import (
-    ClusterAddress,
-    ClusterData,
-    Jobs,
-    Out,
-    PartStart,
-    Truths,
-    name_recordings,
-    runner,
-    truth_texts,
-)
+from app.cli.evaluate import ClusterAddress, ClusterData, Jobs, Out, PartStart, Truths, read_subjects, runner
 from app.cli.options import Duration, ParamsFor, with_params
 from app.slam.errors import HemislamError
 from app.slam.text_files import make_folder
@@ -96,8 +87,6 @@ def tune(
     from tqdm import tqdm
 
     from app.cli.run import compile_behind_bar
-    from app.evaluation.evaluate import Subject
-    from app.evaluation.truth import read_truth
     from app.mapping.session_file import read_marks
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import BEST
@@ -110,12 +99,7 @@ def tune(
     if labels is not None and len(recordings) > 1:
         raise HemislamError("--labels belong to one recording; give only that one.")
     marks = read_marks(labels) if labels else ()
-    subjects = [
-        Subject(name, path, params_for(path), read_truth(text, path, None) if text else None, marks=marks)
-        for path, name, text in zip(
-            recordings, name_recordings(recordings), truth_texts(recordings, truths or []), strict=True
-        )
-    ]
+    subjects = [replace(one, marks=marks) for one in read_subjects(recordings, params_for, truths or [])]
     usual = "ate" if all(subject.truth is not None for subject in subjects) else "entropy"
     wanted = choose_objectives(objectives or [usual], subjects)
     if held_back and duration is None:
