@@ -20,9 +20,12 @@ def projected(name: str) -> "pyproj.CRS":
     """A coordinate system by "EPSG:code" or WKT.
 
     Raises:
-        HemislamError: there is none, or it is not a plane grid in metres.
+        HemislamError: there is none, or it is not a plane grid in metres, or has heights as well.
     """
     crs = _system(name, "give one as EPSG:32632")
+    if crs.is_compound:
+        parts = (":".join(part.to_authority() or (part.name,)) for part in crs.sub_crs_list)
+        raise HemislamError(f"{name} ({crs.name}) also has heights; give {' and, as that of heights, '.join(parts)}.")
     if not crs.is_projected:
         raise HemislamError(f"{name} ({crs.name}) is not a plane grid; give a projected one such as EPSG:32632.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info):

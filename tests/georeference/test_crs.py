@@ -33,7 +33,13 @@ def test_a_grid_of_the_other_side_of_the_earth_is_refused_and_the_right_one_name
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("EPSG:1", "names no"), ("Mars", "names no"), ("EPSG:4326", "not a plane"), ("EPSG:2263", "not in metres")],
+    [
+        ("EPSG:1", "names no"),
+        ("Mars", "names no"),
+        ("EPSG:4326", "not a plane"),
+        ("EPSG:2263", "not in metres"),
+        ("EPSG:5555", "give EPSG:25832 and, as that of heights, EPSG:5783"),
+    ],
 )
 def test_what_is_no_grid_in_metres_is_refused(name: str, words: str) -> None:
     with pytest.raises(HemislamError, match=words):
