@@ -1,6 +1,6 @@
 """Satellite fixes: where an antenna was, by GNSS."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,7 +37,9 @@ class Fixes(Samples):
         return np.column_stack([self.latitude, self.longitude, self.height])
 
     def sound(self, source: str) -> "Fixes":
-        """In order of time and without empty ones. A sigma that is not greater than zero is unknown.
+        """In order of time, without empty ones, and with longitudes that do not jump from 180° to -180°.
+
+        A sigma that is not greater than zero is unknown.
 
         Raises:
             HemislamError: naming `source`: fewer than three fixes, or no place on Earth.
@@ -58,4 +60,4 @@ class Fixes(Samples):
             )
         if (np.abs(fixes.longitude) > 360).any():
             raise HemislamError(f"{source} has a longitude beyond 360°; it must be in degrees.")
-        return fixes
+        return replace(fixes, longitude=np.unwrap(fixes.longitude, period=360.0))

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.georeference.ground import Ground
 from app.georeference.tables import GEOID, read_fixes
 from app.slam.errors import HemislamError
 
@@ -40,6 +41,15 @@ def test_dates_are_read_and_rows_are_brought_in_order_of_time(tmp_path: Path) ->
     fixes, _ = read_fixes(written(tmp_path, text), NEAR_NS)
     assert fixes.stamps_ns.tolist() == [NEAR_NS + k * 10**9 for k in range(3)]
     assert fixes.longitude.tolist() == [11.0, 11.1, 11.2] and np.isnan(fixes.sigmas).all()
+
+
+def test_a_walk_across_the_antimeridian_stays_in_one_place(tmp_path: Path) -> None:
+    """Taveuni, Fiji. The median of longitudes on both sides lies in Africa."""
+    longitudes = (179.99999, -179.99999, 179.99998, -179.99998)
+    text = "time,lat,lon,height\n" + "".join(f"{k},-16.8,{lon},5\n" for k, lon in enumerate(longitudes))
+    fixes, _ = read_fixes(written(tmp_path, text), NEAR_NS)
+    ground = Ground.of(fixes)
+    assert ground.centre.crs == "EPSG:32701" and np.ptp(ground.places[:, 0]) == pytest.approx(4.26, abs=0.01)
 
 
 def test_seconds_of_the_gps_week_become_utc_by_the_recordings_week_and_leap_seconds(tmp_path: Path) -> None:
