@@ -169,26 +169,27 @@ def _difference(recordings: Sequence[Evaluated], name: str, base: str, metric: _
     ours, theirs = (float(np.mean([pair[k] for pair in pairs])) for k in (1, 2))
     verdict, against = _compare(ours, theirs, metric.like)
     words = f"{verdict}, {theirs:{metric.digits}} to {ours:{metric.digits}} {metric.unit}"
-    certainty, rest = _certainty(pairs), ""
+    (certainty, may_be_chance), rest = _certainty(pairs), ""
     worse = [pair[0] for pair in pairs if _compare(pair[1], pair[2], metric.like)[1]]
     if len(pairs) > 1:
         words += f" over {len(pairs)} recordings{certainty}"
         where = ", ".join(worse) if len(worse) <= MOST_NAMED else f"{len(worse)} of them"
         where = "all" if len(worse) == len(pairs) else where
         rest = f"; it rises on {where}" if worse else ""
-    certain = verdict != _SAME and "chance" not in certainty
+    certain = verdict != _SAME and not may_be_chance
     return _Difference(words, abs(ours - theirs) / max(abs(theirs), 1e-9) if certain else 0.0, against, rest)
 
 
-def _certainty(pairs: Sequence[tuple[str, float, float]]) -> str:
-    """How certain the mean difference is, in words."""
+def _certainty(pairs: Sequence[tuple[str, float, float]]) -> tuple[str, bool]:
+    """How certain the mean difference is, in words, and whether it may be chance."""
     if len(pairs) < 3:
-        return ""
+        return "", False
     differences = np.array([ours - theirs for _, ours, theirs in pairs])
     error = float(differences.std(ddof=1) / np.sqrt(len(pairs)))
     base, mean = float(np.mean([theirs for _, _, theirs in pairs])), abs(float(differences.mean()))
-    chance = ": may be chance" if LIKE * base < mean < CHANCE * error else ""
-    return f" (± {100 * error / base:.1f} %, one standard error{chance})"
+    may_be_chance = LIKE * base < mean < CHANCE * error
+    words = f" (± {100 * error / base:.1f} %, one standard error{': may be chance' if may_be_chance else ''})"
+    return words, may_be_chance
 
 
 def _compare(ours: float, theirs: float, like: float) -> tuple[str, bool]:
