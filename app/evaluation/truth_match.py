@@ -9,9 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from app.evaluation.truth import TruePoses
-from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.metrics import alignment_doubt, interpolate, umeyama
+from app.slam.metrics import ate, interpolate, umeyama
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
 
@@ -111,16 +110,14 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
     theirs, usable = interpolate(there, estimate.stamps_ns)
     if len(theirs) < 3:
         return there, True, ""  # the metrics report it
-    ours = estimate.chosen(usable)
-    T = umeyama(ours.positions, theirs.positions)
-    left = lie.moved(T, ours.positions) - theirs.positions
-    if doubt := alignment_doubt(theirs.positions, float(np.sqrt((left**2).sum(axis=1).mean()))):
-        if not certainly:
-            return there, True, ""
-        why = f"Its axes are not the IMU's, and this trajectory does not determine the rotation between them. {doubt}"
-        return _borrow_rotation(there, estimate), False, why
-    R_truth_estimate = Rotation.from_matrix(T[:3, :3])
-    between = theirs.rotations.inv() * R_truth_estimate * ours.rotations
+    aligned = ate(estimate, there)
+    if aligned.doubt and not certainly:
+        return there, True, ""
+    if aligned.doubt:
+        why = "Its axes are not the IMU's, and this trajectory does not determine the rotation between them."
+        return _borrow_rotation(there, estimate), False, f"{why} {aligned.doubt}"
+    R_truth_estimate = Rotation.from_matrix(aligned.T_truth_estimate[:3, :3])
+    between = theirs.rotations.inv() * R_truth_estimate * estimate.rotations[usable]
     R_body_imu = between.mean()
     angle = float(np.degrees(R_body_imu.magnitude()))
     spread = float(np.degrees(np.median((R_body_imu.inv() * between).magnitude())))
