@@ -134,7 +134,7 @@ def read_angles(path: Path) -> ChannelAngles:
         table = np.array(rows, np.float64)
     except OSError as error:
         raise HemislamError(f"The angles {path} cannot be read ({error.strerror}); check the path.") from None
-    except (ValueError, UnicodeDecodeError):
+    except (ValueError, csv.Error):
         table = np.empty((0, 0))
     counts = (BPEARL.channels, AIRY.channels)
     if table.shape not in [(count, 2) for count in counts] or not (np.abs(table) <= (91.0, np.finfo(float).max)).all():

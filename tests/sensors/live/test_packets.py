@@ -115,7 +115,7 @@ def test_angles_come_from_a_file_the_device_or_the_data_sheet(tmp_path: Path) ->
     decoder = Decoder(read_angles(file))
     decoder.configure(plain)
     assert decoder.calibration.elevations_deg[3] == pytest.approx(ANGLES[3][0], abs=0.0051)
-    for text in ("", "1,2\n", "a,b\n" * 32, "200,0\n" * 32):
+    for text in ("", "1,2\n", "a,b\n" * 32, "200,0\n" * 32, "1" * 200_000):
         file.write_text(text)
         with pytest.raises(HemislamError, match=r"angles\.csv is not a calibration"):
             read_angles(file)
