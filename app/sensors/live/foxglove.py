@@ -28,6 +28,8 @@ MAX_MESSAGE = 256 << 20
 RETRY_S = 1.0
 _MOST_DELAY_NS = 800_000_000
 """Of a network; log times that are older are not trusted."""
+_FAR_NS = 1 << 62
+"""The year 2116; a later log time is none."""
 MESSAGE = struct.Struct("<BIQ")
 
 Sensor = Literal["lidar", "imu"]
@@ -100,6 +102,7 @@ class FoxgloveReceiver:
                     self._subscribe(connection, intake)
             elif len(message) >= MESSAGE.size and message[0] == 1:
                 _, number, log_ns = MESSAGE.unpack_from(message)
+                log_ns = log_ns if log_ns < _FAR_NS else 0
                 if number in self._subscribed:
                     self._receive(*self._subscribed[number], message[MESSAGE.size :], log_ns, intake)
 

@@ -90,9 +90,10 @@ def _note(text: str, subscriptions: dict[int, int]) -> None:
     try:
         said = json.loads(text)
         if said["op"] == "subscribe":
-            subscriptions.update({int(s["channelId"]): int(s["id"]) for s in said["subscriptions"]})
+            asked = {int(s["channelId"]): int(s["id"]) for s in said["subscriptions"]}
+            subscriptions.update({channel: number for channel, number in asked.items() if 0 <= number < 1 << 32})
         elif said["op"] == "unsubscribe":
             for channel in [c for c, number in subscriptions.items() if number in said["subscriptionIds"]]:
                 del subscriptions[channel]
-    except (ValueError, KeyError, TypeError):  # not of this protocol
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # not of this protocol
         return

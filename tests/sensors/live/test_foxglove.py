@@ -169,6 +169,20 @@ def test_nonsense_from_a_server_is_passed_over() -> None:
         assert source.state().counters.unreadable > 20
 
 
+def test_a_log_time_that_no_integer_holds_is_none() -> None:
+    channels = [Channel(0, "/points", "cdr", ros.CLOUD, ""), Channel(1, "/imu", "cdr", ros.IMU, "")]
+    with (
+        FoxgloveServer("127.0.0.1", 0, channels) as server,
+        open_live(f"foxglove://127.0.0.1:{server.port}", Params()) as source,
+    ):
+        assert server.wait_for_subscribers(5.0)
+        for topic, _, message in rig.walk(turns=20, columns=30):
+            message.header = ros.header(0, "")
+            server.publish(["/points", "/imu"].index(topic), 2**63, ros.serialised(message))
+        ports.collect(source, lambda events: source.state().counters.packets == 20)
+        assert source.state().lidar_age_s is not None
+
+
 def test_a_connection_that_ends_is_made_again() -> None:
     number = port()
     with open_live(f"foxglove://127.0.0.1:{number}", Params()) as source:
@@ -205,6 +219,8 @@ def test_our_server_offers_both_names_and_survives_clients_that_leave() -> None:
                 assert [c["topic"] for c in said[1]["channels"]] == ["/a", "/b"]
                 client.send("nonsense")
                 client.send(b"nonsense")
+                for number in (-1, 2**32, 1e999):
+                    client.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": number, "channelId": 0}]}))
                 client.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 5, "channelId": 1}]}))
                 assert not server.wait_for_subscribers(0.2)
                 server.publish(0, 1, b"nobody asked")
