@@ -13,6 +13,8 @@ CLASSIC_MAGIC = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", 
 NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
 MAX_RECORD = 1 << 22
 _FAR_NS = 1 << 62
+_MOST_INTERFACES = 1024
+"""Of a section; packets of further ones are passed over."""
 _FRAGMENTS_KEPT = 64
 """Datagrams that may wait for missing fragments; beyond that, the oldest is given up."""
 
@@ -129,7 +131,7 @@ class Capture:
             body = file.read(length - 8)
             if len(body) < length - 8:
                 break
-            if kind == 1 and len(body) >= 12:
+            if kind == 1 and len(body) >= 12 and len(interfaces) < _MOST_INTERFACES:
                 interfaces = (*interfaces, _interface(body, order))
             elif kind == 6 and len(body) >= 24:
                 number, high, low, captured, _ = struct.unpack_from(order + "5I", body)

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -274,6 +275,16 @@ def test_angles_beside_the_capture_win(tmp_path: Path) -> None:
     lowest = scan.points[scan.ring == 0]
     tilt = np.degrees(np.arctan2(lowest[:, 2] - 0.09427, np.hypot(lowest[:, 0], lowest[:, 1]) - 0.01473))
     assert np.median(tilt) == pytest.approx(2.3125 - 0.5, abs=0.01)
+
+
+def test_a_capture_of_countless_interfaces_is_read_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "walk.pcapng"
+    whole = captures.pcapng(walk())
+    interface = struct.pack("<IIHHII", 1, 20, 1, 0, 0, 20)
+    path.write_bytes(whole + interface * 100_000)
+    began = monotonic()
+    assert len(measurements(path)) == TURNS
+    assert monotonic() - began < 30.0  # a minute and more if each took as long as all before it
 
 
 def test_a_damaged_capture_is_read_or_refused_but_never_crashes(tmp_path: Path) -> None:
