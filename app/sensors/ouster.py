@@ -37,6 +37,8 @@ _POINT = np.dtype(
 )
 _RUN_IN = 2
 """Reading begins where this many scans earlier was complete."""
+MOST_COLUMNS = 4096
+"""Of a turn, in the finest mode of any Ouster."""
 LATE = 4
 """After this many packets of the next turn, packets of this one are no longer waited for."""
 
@@ -118,7 +120,7 @@ class Metadata:
             )  # fmt: skip
         except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             return None
-        if not 0 < found.columns <= found.width:
+        if not 0 < found.columns <= found.width <= MOST_COLUMNS:
             raise HemislamError(
                 f"{path.name} states {found.columns} columns a packet and {found.width} a turn, which no sensor sends; "
                 "copy the metadata from the sensor again."

@@ -259,6 +259,9 @@ def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path) -> None:
         path = made("LEGACY", tmp_path, columns_per_packet=columns, lidar_data_format={}, columns_per_frame=32)
         with pytest.raises(HemislamError, match="columns a packet"):
             open_recording(path, Params())
+    path = made("LEGACY", tmp_path, columns_per_packet=16, lidar_data_format={}, columns_per_frame=10**9)
+    with pytest.raises(HemislamError, match="1000000000 a turn, which no sensor sends"):
+        open_recording(path, Params())
     path = made("LEGACY", tmp_path, columns_per_packet=math.inf, lidar_data_format={}, columns_per_frame=32)
     with pytest.raises(HemislamError, match="need its metadata"):
         open_recording(path, Params())
