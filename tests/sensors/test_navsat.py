@@ -68,7 +68,7 @@ def test_a_recording_without_a_receiver_says_what_to_give(tmp_path: Path) -> Non
         recorded_fixes(tmp_path / "walk.mcap")
 
 
-@pytest.mark.parametrize("text", ["noise", "noise=x", "colour=1", "rate=0", "outliers=2"])
+@pytest.mark.parametrize("text", ["noise", "noise=x", "colour=1", "rate=0", "outliers=2", "offset=1e12"])
 def test_a_receiver_that_cannot_be_is_refused(text: str) -> None:
     with pytest.raises(HemislamError):
         Gnss().with_sizes([text])

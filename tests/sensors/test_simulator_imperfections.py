@@ -173,6 +173,14 @@ def test_sizes_are_set_by_name() -> None:
     for wrong in ("delay=1", "late=soon", "late", "late=-1"):
         with pytest.raises(HemislamError, match=f"`{wrong}` is not NAME=VALUE with a NAME of accel_scale"):
             NONE.with_sizes([wrong])
+    for wrong in ("late=1e30", "jitter=3601"):
+        with pytest.raises(HemislamError, match="by more than an hour"):
+            NONE.with_sizes([wrong])
+
+
+def test_an_imu_may_lose_every_sample(tmp_path: Path) -> None:
+    made = simulate("room", tmp_path / "walk.mcap", duration_s=0.5, every_block=90, imperfections=Imperfections(lost=1))
+    assert made.scans == 4
 
 
 def test_an_imperfect_recording_keeps_the_exact_truth_of_the_same_walk(tmp_path: Path) -> None:

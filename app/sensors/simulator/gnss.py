@@ -42,10 +42,11 @@ class Gnss:
     def with_sizes(self, assignments: Sequence[str]) -> "Gnss":
         """With other values, each given as `name=value`. Raises HemislamError, which names them."""
         made = replace(self, **read_numbers(assignments, self.__slots__))
-        if not (0.1 <= made.rate <= 50 and made.noise > 0 and 0 <= made.outliers <= 1 and abs(made.latitude) <= 84):
+        shares = 0.1 <= made.rate <= 50 and made.noise > 0 and 0 <= made.outliers <= 1
+        if not (shares and abs(made.latitude) <= 84 and abs(made.offset) <= 3600):
             raise HemislamError(
-                "A simulated receiver has a rate of 0.1 to 50, a noise over 0, outliers of 0 to 1, and a latitude"
-                " within 84."
+                "A simulated receiver has a rate of 0.1 to 50, a noise over 0, outliers of 0 to 1, a latitude within"
+                " 84, and an offset within 3600."
             )
         return made
 

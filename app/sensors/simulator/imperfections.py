@@ -12,6 +12,7 @@ from app.sensors.robosense import CHANNELS
 from app.sensors.simulator.raycast import Hits, Mover, Raycaster, SimulatedScene
 from app.sensors.simulator.scenes.props import person_mesh
 from app.sensors.simulator.trajectory import SmoothTrajectory, Walker, seconds
+from app.slam.errors import HemislamError
 from app.slam.lie import exp, transform
 from app.slam.types import F64, ImuSamples
 from app.slam.user_text import read_numbers
@@ -21,6 +22,7 @@ GLASS_REFLECTIVITY = 0.05
 PANE_M = 0.1
 JUMP_M = 0.15
 VIBRATION_HZ = (25.0, 70.0)
+MOST_LATE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,10 @@ class Imperfections:
 
     def with_sizes(self, assignments: Sequence[str]) -> "Imperfections":
         """With other sizes, each given as `name=size`. Raises HemislamError, which names the terms."""
-        return replace(self, **read_numbers(assignments, self.__slots__, least=0.0))
+        made = replace(self, **read_numbers(assignments, self.__slots__, least=0.0))
+        if max(made.late, made.jitter) > MOST_LATE_S:
+            raise HemislamError("A simulated IMU's stamps cannot be late, or vary, by more than an hour (3600 s).")
+        return made
 
 
 NONE = Imperfections()

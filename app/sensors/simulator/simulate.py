@@ -168,7 +168,7 @@ def simulate(
                 recording.add_scan(scan, logged_ns)
                 progress(index + 1, total)
             add_imu(len(imu))
-            add_fixes(int(imu.stamps_ns[-1]))
+            add_fixes(int(imu_stamps[-1]))
             recording.finish()
         _write_truth(truth, trajectory, np.array(ends, np.int64))
         params.write_text(_SIDECAR + yaml.safe_dump(_settings(device.lidar)))
