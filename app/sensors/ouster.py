@@ -4,9 +4,7 @@ Source: Ouster's sensor documentation, "Lidar data packet format" and "Coordinat
 frame, as the ROS driver's `os_lidar`; topics and units are that driver's.
 """
 
-import bisect
 import json
-from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,8 +16,9 @@ import numpy as np
 from app.sensors import ros
 from app.sensors.findings import Finding
 from app.sensors.imu_units import STANDARD_GRAVITY
-from app.sensors.live.devices import mount_finding, sender_of, senders_finding
-from app.sensors.live.pcap import Capture, CapturePlace
+from app.sensors.live.capture import PacketStream
+from app.sensors.live.devices import mount_finding
+from app.sensors.live.pcap import Datagram
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64, I64, U8
@@ -35,8 +34,6 @@ _POINT = np.dtype(
         "itemsize": 20,
     }
 )
-_RUN_IN = 2
-"""Reading begins where this many scans earlier was complete."""
 MOST_COLUMNS = 4096
 """Of a turn, in the finest mode of any Ouster."""
 LATE = 4
@@ -202,41 +199,29 @@ class Turns:
         return [packet for _, packet in sorted(self._open.pop(turn).items())]
 
 
-class OusterStream:
-    """Topics and messages of such a capture; see `app.sensors.source.Stream`.
-
-    Attributes:
-        complete: whether the file has its end. findings: what the packets are, and what was lost of them.
-    """
-
-    by_log_time = True
+class OusterStream(PacketStream):
+    """A capture of an Ouster; its contents are an IMU packet (bytes), or all packets of a scan (a list)."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         """Raises CaptureError: the file is no capture."""
-        self._capture, self._metadata = Capture(path), metadata
-        self._sender = sender_of(self._capture.datagrams(), self._is_measured)
-        self._other_senders: set[bytes] = set()
-        self._complete_at: list[tuple[int, CapturePlace]] = []
-        logged, samples, missing = array("q"), 0, 0
-        for log_ns, place, content in self._read(None):
-            logged.append(log_ns)
+        super().__init__(path, lambda packet: len(packet) == metadata.packet_bytes)
+        self._metadata, self._topics = metadata, {list: LIDAR_TOPIC, bytes: IMU_TOPIC}
+        scans = samples = missing = 0
+        for _, content in self._index(list):
             if isinstance(content, list):
-                self._complete_at.append((log_ns, place))
+                scans += 1
                 missing += max(metadata.width // metadata.columns - len(content), 0)
             else:
                 samples += 1
-        self.start_ns, self.end_ns = (logged[0], logged[-1]) if logged else (0, 0)
-        scans = len(self._complete_at)
         topics = ((LIDAR_TOPIC, ros.CLOUD, scans), (IMU_TOPIC, ros.IMU, samples))
         self.counts = {topic: (kind, count) for topic, kind, count in topics if count}
-        self.complete = self._capture.complete
         end = "" if self.complete else "; the file is cut off there"
         text = f"{scans} scans, {samples} IMU samples, {missing} packets missing{end}"
         rows = f"{metadata.name}, {len(metadata.elevations)} x {metadata.width}, by the .json beside the file"
         found = [
             Finding("packets", "corrected" if missing or not self.complete else "fine", text),
             Finding("sensor", "fine", rows),
-            *senders_finding(path, self._sender, self._other_senders),
+            *self._senders_finding(),
         ]
         R = metadata.T_imu_lidar[:3, :3]
         if np.isfinite(metadata.T_imu_lidar).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3):
@@ -246,46 +231,22 @@ class OusterStream:
             found.append(Finding("IMU", "needs you", missed))
         self.findings = tuple(found)
 
-    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
-        """(topic, log time ns, message) of what was logged within [start, stop), by log time."""
-        number = bisect.bisect_left(self._complete_at, start_ns, key=lambda row: row[0]) - _RUN_IN
-        running_ns, place = self._complete_at[number] if number >= 0 else (0, None)
-        for log_ns, _, content in self._read(place, running_ns):
-            if log_ns >= stop_ns:
-                return
-            if log_ns < start_ns:
-                continue
-            if isinstance(content, list):
-                if LIDAR_TOPIC in topics:
-                    yield LIDAR_TOPIC, log_ns, self._cloud(content)
-            elif IMU_TOPIC in topics:
-                yield IMU_TOPIC, log_ns, _imu_message(content)
-
-    def close(self) -> None:
-        """Nothing stays open between two readings."""
-
-    def _read(
-        self, place: CapturePlace | None, running_ns: int = 0
-    ) -> Iterator[tuple[int, CapturePlace, bytes | list[bytes]]]:
-        """Log time, place in the file, and an IMU packet or all packets of a scan."""
-        meta, at = self._metadata, place or CapturePlace(0)
+    def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[bytes | list[bytes]]:
+        meta = self._metadata
         turns = Turns(meta.width // meta.columns)
-        for datagram in self._capture.datagrams(place):
-            running_ns, at, payload = max(running_ns, datagram.time_ns), datagram.place, datagram.payload
-            if datagram.sender != self._sender:
-                if self._is_measured(payload):
-                    self._other_senders.add(datagram.sender)
-            elif len(payload) == _IMU.itemsize:
-                yield running_ns, at, payload
+        for _, datagram in datagrams:
+            payload = datagram.payload
+            if self._is_of_another(datagram):
+                continue
+            if len(payload) == _IMU.itemsize:
+                yield payload
             elif self._is_measured(payload):
                 column = int.from_bytes(payload[(first := meta.profile.header + 8) : first + 2], "little")
-                for packets in turns.add(self._frame_of(payload), column, payload):
-                    yield running_ns, at, packets
-        for packets in turns.rest():
-            yield running_ns, at, packets
+                yield from turns.add(self._frame_of(payload), column, payload)
+        yield from turns.rest()
 
-    def _is_measured(self, packet: bytes) -> bool:
-        return len(packet) == self._metadata.packet_bytes
+    def _message(self, content: bytes | list[bytes], log_ns: int) -> Any:
+        return self._cloud(content) if isinstance(content, list) else _imu_message(content)
 
     def _frame_of(self, packet: bytes) -> int:
         at = 2 if self._metadata.profile.header else 10

@@ -1,13 +1,17 @@
 """A network capture as a recording: a sensor's packets and `imu-udp` datagrams of a .pcap or .pcapng.
 
-Opening reads the file once and notes where each revolution was complete, so that reading can begin near any time. The
-packets are recognised by their content, whatever their ports. Those of a second LiDAR are left out.
+Opening reads the file once and notes where each scan was complete, so that reading can begin near any time. The packets
+are recognised by their content, whatever their ports. Those of a second LiDAR are left out.
 """
 
 import bisect
+from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from ipaddress import ip_address
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,13 +21,13 @@ from app.sensors import ros
 from app.sensors.clocks import TOLERANCE_S
 from app.sensors.findings import Finding
 from app.sensors.live.clock import JUMP_NS, ClockMap
-from app.sensors.live.devices import DEVICES, device_of, mount_finding, sender_of, senders_finding
+from app.sensors.live.devices import DEVICES, device_of, mount_finding
 from app.sensors.live.difop import DIFOP_ID, Difop, read_angles, read_difop
 from app.sensors.live.frames import Assembler, Revolution, sensor_of
 from app.sensors.live.imu_udp import IMU_MAGIC, ImuOrder, ImuSample, is_imu, read_imu
 from app.sensors.live.livox_udp import read_points
 from app.sensors.live.msop import other_sensor
-from app.sensors.live.pcap import Capture, CapturePlace
+from app.sensors.live.pcap import Capture, CapturePlace, Datagram
 from app.sensors.live.status import Counters
 from app.sensors.robosense import Model
 from app.slam.errors import HemislamError
@@ -31,31 +35,127 @@ from app.slam.types import I64, Scan
 
 SUFFIXES = (".pcap", ".pcapng")
 _COMPARED = 1_000
+"""Packets of measurements, half a second of a sensor, that settle which of several LiDARs is read; and messages that
+settle whether two clocks agree."""
 _RUN_IN = 2
-"""Reading begins where this many revolutions earlier was complete: all packets of the wanted one lie behind that."""
+"""Reading begins where this many scans earlier was complete: all packets of the wanted one lie behind that."""
 
 V = TypeVar("V")
 Shifts = list[tuple[int, int]]
 """From which log time on how many ns are added to a sensor's stamps."""
 
 
-class CaptureStream:
-    """Topics and messages of a capture; see `app.sensors.source.Stream`.
+class PacketStream(ABC):
+    """What captures of every LiDAR have in common; see `app.sensors.source.Stream`.
+
+    A content is what packets give once they are complete: all packets of a scan, an IMU sample, or a sensor's settings.
+
+    Args:
+        is_measured: whether a packet holds measurements of such a LiDAR. topics: by the type of a content; others are
+            no messages.
 
     Attributes:
         complete: whether the file has its end. findings: what the packets are, and what was lost of them.
     """
 
     by_log_time = True
+    counts: dict[str, tuple[str, int]]
+    findings: tuple[Finding, ...]
+
+    def __init__(self, path: Path, is_measured: Callable[[bytes], bool]) -> None:
+        """Raises CaptureError: it is no capture."""
+        self._path, self._capture, self._is_measured = path, Capture(path), is_measured
+        senders = (one.sender for one in self._capture.datagrams() if is_measured(one.payload))
+        most = Counter(islice(senders, _COMPARED)).most_common(1)  # of equals, the first
+        self._sender = most[0][0] if most else None
+        self._other_senders: set[bytes] = set()
+        self._complete_at: list[tuple[int, CapturePlace]] = []
+        self._topics: dict[type, str] = {}
+        self.start_ns = self.end_ns = 0
+
+    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
+        """(topic, log time ns, message) of what was logged within [start, stop), by log time."""
+        number = bisect.bisect_left(self._complete_at, start_ns, key=lambda row: row[0]) - _RUN_IN
+        running_ns, place = self._complete_at[number] if number >= 0 else (0, None)
+        for log_ns, _, content in self._read(place, running_ns):
+            if log_ns >= stop_ns:
+                return
+            topic = self._topics.get(type(content), "")
+            if log_ns >= start_ns and topic in topics:
+                yield topic, log_ns, self._message(content, log_ns)
+
+    def close(self) -> None:
+        """Nothing stays open between two readings."""
+        return
+
+    @abstractmethod
+    def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[Any]:
+        """What these complete. datagrams: each with its log time, which never steps back."""
+
+    @abstractmethod
+    def _message(self, content: Any, log_ns: int) -> Any:
+        """The content as a message of its topic."""
+
+    def _index(self, scans: type) -> Iterator[tuple[int, Any]]:
+        """Log time and content of the first reading, which finds start, end, and where the scans are complete."""
+        for log_ns, place, content in self._read(None, 0):
+            if type(content) in self._topics:
+                self.start_ns = self.start_ns or log_ns
+                self.end_ns = log_ns
+            if isinstance(content, scans):
+                self._complete_at.append((log_ns, place))
+            yield log_ns, content
+        self.complete = self._capture.complete
+
+    def _read(self, place: CapturePlace | None, running_ns: int) -> Iterator[tuple[int, CapturePlace, Any]]:
+        """Log time, place in the file, and what was complete there; from a place on, or all.
+
+        running_ns: the newest log time before that place.
+        """
+        at = place or CapturePlace(0)
+
+        def datagrams() -> Iterator[tuple[int, Datagram]]:
+            nonlocal at, running_ns
+            for datagram in self._capture.datagrams(place):
+                at, running_ns = datagram.place, max(running_ns, datagram.time_ns)
+                yield running_ns, datagram
+
+        for content in self._contents(datagrams()):
+            yield running_ns, at, content
+
+    def _is_of_another(self, datagram: Datagram) -> bool:
+        """Whether it comes from another address than the LiDAR's. Other LiDARs are noted."""
+        if datagram.sender == self._sender:
+            return False
+        if self._is_measured(datagram.payload):
+            self._other_senders.add(datagram.sender)
+        return True
+
+    def _senders_finding(self) -> list[Finding]:
+        """Which of several LiDARs is read, and how to read another."""
+        if self._sender is None or not self._other_senders:
+            return []
+        used, left_out = (
+            ip_address(self._sender),
+            ", ".join(str(ip_address(one)) for one in sorted(self._other_senders)),
+        )
+        text = (
+            f"{1 + len(self._other_senders)} LiDARs send in this capture; only {used} is read, and {left_out} left "
+            "out. A .json or .angles.csv beside the file must belong to the LiDAR that is read. To read another, "
+            f"remove this one: `tcpdump -r {self._path} -w other.pcap not src host {used}`"
+        )
+        return [Finding("LiDARs", "needs you", text)]
+
+
+class CaptureStream(PacketStream):
+    """A capture of one of `DEVICES`, or of `imu-udp` alone."""
 
     def __init__(self, path: Path) -> None:
         """Raises CaptureError: it is no capture. HemislamError: its sensor, or the angles beside it, cannot be read."""
         from app.sensors.live.decoder import Decoder
 
-        self._path, self._capture = path, Capture(path)
+        super().__init__(path, lambda packet: sensor_of(packet) is not None)
         sidecar = path.with_name(f"{path.stem}.angles.csv")
-        self._sender = sender_of(self._capture.datagrams(), lambda payload: sensor_of(payload) is not None)
-        self._other_senders: set[bytes] = set()
         found = device_of(one.payload for one in self._capture.datagrams() if one.sender == self._sender)
         others = (other for one in self._capture.datagrams() if (other := other_sensor(one.payload)))
         if found is None and (other := next(others, "")):
@@ -64,36 +164,24 @@ class CaptureStream:
             )
         self._device = found or DEVICES["rsbpearl"]
         self._lidar_topic, self._imu_topic = self._device.layout.lidar_topic, self._device.layout.imu_topic
+        self._topics = {Revolution: self._lidar_topic, ImuSample: self._imu_topic}
         model, own = self._device.model, sidecar.is_file() and self._device.has_angles
         self._decoder = Decoder(read_angles(sidecar) if own else None, model) if isinstance(model, Model) else None
         self._angles = f"from {sidecar.name}" if own else ""
         self._devices: list[tuple[int, Difop]] = []
-        self._complete_at: list[tuple[int, CapturePlace]] = []
-        self._counters = Counters()
         self._beside = self._own = False  # whether there are samples of `imu-udp`, and of the sensor's own IMU
-        self._index()
-        self.complete = self._capture.complete
+        self._take_stock()
         self.findings = self._findings()
 
-    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
-        """(topic, log time ns, message) of what was logged within [start, stop), by log time."""
-        number = bisect.bisect_left(self._complete_at, start_ns, key=lambda row: row[0]) - _RUN_IN
-        running_ns, place = self._complete_at[number] if number >= 0 else (0, None)
-        device = None
-        for log_ns, _, content in self._read(place, running_ns, Counters()):
-            if log_ns >= stop_ns:
-                return
-            if log_ns < start_ns:
-                continue
-            if isinstance(content, ImuSample) and self._imu_topic in topics:
-                stamp_ns = content.stamp_ns + _value_at(self._imu_shifts, log_ns)
-                yield self._imu_topic, log_ns, ros.imu_message(stamp_ns, content.gyro, content.accel)
-            elif isinstance(content, Revolution) and self._lidar_topic in topics:
-                if self._devices and (difop := _value_at(self._devices, log_ns)) is not device:
-                    device = difop
-                    if self._decoder is not None:
-                        self._decoder.configure(difop)
-                yield self._lidar_topic, log_ns, self._cloud(content, _value_at(self._lidar_shifts, log_ns))
+    def _message(self, content: Revolution | ImuSample, log_ns: int) -> Any:
+        if isinstance(content, ImuSample):
+            stamp_ns = content.stamp_ns + _value_at(self._imu_shifts, log_ns)
+            return ros.imu_message(stamp_ns, content.gyro, content.accel)
+        if self._decoder is not None and self._devices:
+            difop = _value_at(self._devices, log_ns)
+            if difop is not self._decoder.difop:
+                self._decoder.configure(difop)
+        return self._cloud(content, _value_at(self._lidar_shifts, log_ns))
 
     def _cloud(self, frame: Revolution, shift_ns: int) -> Any:
         """The message of a revolution."""
@@ -105,27 +193,14 @@ class CaptureStream:
             return ros.cloud_message(replace(scan, stamp_ns=stamp_ns), exact=True)
         return ros.empty_cloud(stamp_ns)
 
-    def close(self) -> None:
-        """Nothing stays open between two readings."""
-
-    def _read(
-        self, place: CapturePlace | None, running_ns: int, counters: Counters
-    ) -> Iterator[tuple[int, CapturePlace, Revolution | ImuSample | Difop]]:
-        """Log time, place in the file, and what was complete there; from a place on, or all.
-
-        Args:
-            running_ns: the newest log time before that place. counters: of what was lost.
-        """
-        assembler, order = Assembler(counters), ImuOrder(counters)
-        at = place or CapturePlace(0)
-        for datagram in self._capture.datagrams(place):
-            at, running_ns, payload = datagram.place, max(running_ns, datagram.time_ns), datagram.payload
-            found: list[Any] = []
+    def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[Revolution | ImuSample | Difop]:
+        counters = self._counters = Counters()
+        assembler, order, model = Assembler(counters), ImuOrder(counters), self._device.model
+        for log_ns, datagram in datagrams:
+            payload = datagram.payload
             beside = payload.startswith(IMU_MAGIC)
-            if not beside and datagram.sender != self._sender is not None:
+            if not beside and self._sender is not None and self._is_of_another(datagram):
                 counters.foreign += 1
-                if sensor_of(payload) is not None:
-                    self._other_senders.add(datagram.sender)
             elif is_imu(payload):
                 if beside and not self._beside and read_imu(payload):
                     self._beside, order = True, ImuOrder(counters)
@@ -133,41 +208,32 @@ class CaptureStream:
                     counters.imu = counters.imu_lost = counters.imu_late = 0
                 self._own |= not beside
                 if beside is self._beside:
-                    found = order.add(payload)
+                    yield from order.add(payload)
                 else:
                     counters.imu_foreign += 1
             elif payload[:8] == DIFOP_ID:
-                model = self._device.model
-                difop = read_difop(payload, model) if isinstance(model, Model) else None
-                found = [difop] if difop is not None else []
+                if isinstance(model, Model) and (difop := read_difop(payload, model)) is not None:
+                    counters.difop += 1
+                    yield difop
             elif (sensor := sensor_of(payload)) is None or sensor in self._device.models:
-                found = assembler.add(payload, running_ns)
+                yield from assembler.add(payload, log_ns)
             else:
                 counters.foreign += 1
-            for content in found:
-                yield running_ns, at, content
-        rest: list[Any] = [*assembler.flush(), *order.flush()]
-        for content in rest:
-            yield running_ns, at, content
+        yield from assembler.flush()
+        yield from order.flush()
 
-    def _index(self) -> None:
+    def _take_stock(self) -> None:
         """The first reading: times of all messages, what the device says, what is lost."""
         lidar, of_imus = array("q"), {False: array("q"), True: array("q")}
-        self.start_ns = self.end_ns = 0
-        for log_ns, place, content in self._read(None, 0, self._counters):
+        for log_ns, content in self._index(Revolution):
             if isinstance(content, Difop):
-                self._counters.difop += 1
                 if not self._devices or not content.same(self._devices[-1][1]):
                     self._devices.append((log_ns, content))
-                continue
-            if isinstance(content, Revolution):
+            elif isinstance(content, Revolution):
                 lidar.extend((int(content.stamps_ns[-1]), log_ns))
-                self._complete_at.append((log_ns, place))
                 self._model = content.model.name
             else:
                 of_imus[self._beside].extend((content.stamp_ns, log_ns))
-            self.start_ns = self.start_ns or log_ns
-            self.end_ns = log_ns
         imu = of_imus[self._beside]
         frames, samples = np.array(lidar, np.int64).reshape(-1, 2), np.array(imu, np.int64).reshape(-1, 2)
         of_topics = ((self._lidar_topic, self._device.layout.kind, frames), (self._imu_topic, ros.IMU, samples))
@@ -202,7 +268,7 @@ class CaptureStream:
         wrong = counters.lost or counters.truncated or counters.late or counters.imu_lost or not self.complete
         text = counters.describe() + ("" if self.complete else "; the file is cut off there")
         found = [Finding("packets", "corrected" if wrong else "fine", text)]
-        found += senders_finding(self._path, self._sender, self._other_senders)
+        found += self._senders_finding()
         if self._lidar_topic in self.counts:
             found += self._device_findings()
         if self._beside and self._own:
