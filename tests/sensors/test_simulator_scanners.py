@@ -80,3 +80,12 @@ def test_a_scanner_without_its_tables_is_refused_by_their_names(tmp_path: Path) 
     with pytest.raises(HemislamError, match="10 scans a second, not 20"):
         simulate("room", tmp_path / "x.mcap", scanner="airy", rate_hz=20)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("content", [b"a,b,c\n1,2,3\n", b"h\n" + b"1,x,3\n" * 128, b"\x93NUMPY", b"\x80\x04N."])
+def test_a_file_that_is_no_table_is_refused_by_its_name(tmp_path: Path, content: bytes) -> None:
+    for name in ("mid360_pattern.npy", "jt128_firetimes.csv", "jt128_angles.csv"):
+        (tmp_path / name).write_bytes(content)
+    for scanner, table in (("mid360", "mid360_pattern.npy"), ("jt128", "jt128_firetimes.csv")):
+        with pytest.raises(HemislamError, match=f"{table} is not the maker's table"):
+            simulate("room", tmp_path / "x.mcap", scanner=scanner, tables=tmp_path)

@@ -67,17 +67,16 @@ def _airy(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
 def _jt128(rate_hz: int, every_block: int, tables: Path | None) -> PatternOfTurn:
     """A Hesai JT128: 128 channels, far apart in azimuth [HesaiLidar_SDK_2.0, angles and firing times]."""
     folder = _tables(tables, "jt128_angles.csv", "jt128_firetimes.csv")
-    angles = np.genfromtxt(folder / "jt128_angles.csv", delimiter=",", skip_header=1, max_rows=128)
-    us = np.genfromtxt(folder / "jt128_firetimes.csv", delimiter=",", skip_header=1, max_rows=128)[:, 1]
-    firing_ns = np.rint(us * 1000).astype(np.int64)
-    elevation, azimuth = np.radians(angles[:, 1:]).T
+    _, firing_us = _table(folder / "jt128_firetimes.csv", 128, 2).T
+    firing_ns = np.rint(firing_us * 1000).astype(np.int64)
+    _, elevation, azimuth = np.radians(_table(folder / "jt128_angles.csv", 128, 3)).T
     pattern = turning(elevation, azimuth, firing_ns, round(1e9 / _RATE_HZ / 900), rate_hz, every_block)
     return lambda turn: pattern
 
 
 def _mid360(rate_hz: int, every_block: int, tables: Path | None) -> PatternOfTurn:
     """A Livox Mid-360: its pattern of 4 s, which does not repeat from scan to scan."""
-    pattern = np.load(_tables(tables, "mid360_pattern.npy") / "mid360_pattern.npy").astype(np.float64)
+    pattern = _table(_tables(tables, "mid360_pattern.npy") / "mid360_pattern.npy", 1, 2)
     firings = _MID360_RATE_HZ // rate_hz
     starts = np.arange(0, firings // _MID360_BLOCK, every_block, dtype=np.int64) * _MID360_BLOCK
     fired = (starts[:, None] + np.arange(_MID360_BLOCK)).ravel()
@@ -103,6 +102,23 @@ def _tables(folder: Path | None, *names: str) -> Path:
             "name the folder that holds them: --tables FOLDER."
         )
     return folder
+
+
+def _table(path: Path, rows: int, columns: int) -> F64:
+    """The numbers in a file: (rows, columns) of a .csv below its heading, at least so many rows of an .npy.
+
+    Raises HemislamError: it holds no such table.
+    """
+    try:
+        if path.suffix == ".csv":
+            table = np.genfromtxt(path, delimiter=",", skip_header=1, max_rows=rows)
+        else:
+            table = np.load(path).astype(np.float64)
+    except (OSError, EOFError, ValueError, TypeError, AttributeError):
+        table = np.empty((0, 0))
+    if table.ndim != 2 or len(table) < rows or table.shape[1] != columns or not np.isfinite(table).all():
+        raise HemislamError(f"{path} is not the maker's table; copy it again.")
+    return np.asarray(table)
 
 
 def _hesai(scan: Any) -> bytes:
