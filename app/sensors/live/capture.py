@@ -40,6 +40,9 @@ settle whether two clocks agree."""
 _RUN_IN = 2
 """Reading begins where this many scans earlier was complete: all packets of the wanted one lie behind that."""
 
+_FAR_NS = 1 << 62
+"""The year 2116; later stamps are cut to it, so that integers hold them."""
+
 V = TypeVar("V")
 Shifts = list[tuple[int, int]]
 """From which log time on how many ns are added to a sensor's stamps."""
@@ -175,20 +178,20 @@ class CaptureStream(PacketStream):
 
     def _message(self, content: Revolution | ImuSample, log_ns: int) -> Any:
         if isinstance(content, ImuSample):
-            stamp_ns = content.stamp_ns + _value_at(self._imu_shifts, log_ns)
+            stamp_ns = _bounded(content.stamp_ns + _value_at(self._imu_shifts, log_ns))
             return ros.imu_message(stamp_ns, content.gyro, content.accel)
         if self._decoder is not None and self._devices:
             difop = _value_at(self._devices, log_ns)
             if difop is not self._decoder.difop:
                 self._decoder.configure(difop)
-        return self._cloud(content, _value_at(self._lidar_shifts, log_ns))
+        return self._cloud(content, _bounded(_value_at(self._lidar_shifts, log_ns)))
 
     def _cloud(self, frame: Revolution, shift_ns: int) -> Any:
         """The message of a revolution."""
         if self._decoder is None:
             return read_points(frame.packets, shift_ns)
         scan = self._decoder.decode(frame)
-        stamp_ns = scan.stamp_ns + shift_ns
+        stamp_ns = _bounded(scan.stamp_ns + shift_ns)
         if isinstance(scan, Scan):
             return ros.cloud_message(replace(scan, stamp_ns=stamp_ns), exact=True)
         return ros.empty_cloud(stamp_ns)
@@ -304,3 +307,7 @@ class CaptureStream(PacketStream):
 def _value_at(rows: list[tuple[int, V]], log_ns: int) -> V:
     """The value that holds at a log time; before the first, the first."""
     return rows[max(bisect.bisect_right(rows, log_ns, key=lambda row: row[0]) - 1, 0)][1]
+
+
+def _bounded(ns: int) -> int:
+    return max(-_FAR_NS, min(ns, _FAR_NS))

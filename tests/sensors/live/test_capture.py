@@ -204,6 +204,18 @@ def test_a_clock_set_on_the_way_does_not_end_the_recording(tmp_path: Path) -> No
     assert len(measurements(path)) == TURNS
 
 
+def test_a_clock_that_leaps_over_all_of_time_leaves_stamps_that_integers_hold(tmp_path: Path) -> None:
+    """Both leaps fall into one moment of the capture, so that all of their samples get the shift of the last."""
+    at = sensor.START_NS + 3 * TURN_NS + 1_000_000
+    last = 2 + (at - sensor.START_NS) // 5_000_000
+    entries = [entry for entry in walk() if entry[1] != 6700 or entry[0] < at]
+    leaps = [2**62 - 2, 2**62 - 1, 2 - 2**62, 3 - 2**62]
+    entries += [(at, 6700, imu(last + 1 + k, stamp)) for k, stamp in enumerate(leaps)]
+    path = tmp_path / "walk.pcap"
+    path.write_bytes(captures.pcap(sorted(entries)))
+    assert len(measurements(path)) >= 2
+
+
 def test_a_file_cut_off_is_used_up_to_there(tmp_path: Path) -> None:
     path = tmp_path / "walk.pcap"
     whole = captures.pcap(walk())
