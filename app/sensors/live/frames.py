@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.sensors.live import msop
-from app.sensors.live.livox_udp import MID360, SCAN_NS, Livox, is_points, read_header
+from app.sensors.live.livox_udp import MID360, SCAN_NS, Livox, read_header
 from app.sensors.live.msop import TURN
 from app.sensors.live.status import Counters
 from app.sensors.robosense import Model
@@ -43,7 +43,7 @@ def _read(packet: bytes) -> _Head | None:
     if model is not None:
         return _Head(model, msop.stamp_of(packet, model), msop.index_of(packet, model))
     header = read_header(packet)
-    return _Head(MID360, header.stamp_ns, header.number) if header is not None and is_points(header) else None
+    return _Head(MID360, header.stamp_ns, header.number) if header is not None and not header.of_imu else None
 
 
 Pending = tuple[int, int, bytes, _Head]

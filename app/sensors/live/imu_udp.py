@@ -67,7 +67,7 @@ def is_imu(datagram: bytes) -> bool:
     if datagram.startswith((IMU_MAGIC, _AIRY_MAGIC)):
         return True
     header = livox_udp.read_header(datagram)
-    return header is not None and not livox_udp.is_points(header)
+    return header is not None and header.of_imu
 
 
 def read_imu(datagram: bytes) -> list[ImuSample]:

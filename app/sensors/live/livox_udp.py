@@ -53,13 +53,10 @@ MID360 = Livox("Mid-360")
 
 @dataclass(frozen=True, slots=True)
 class LivoxHeader:
-    """Attributes:
-    count: points. number: of the packet, wraps at 65536. kind: 0 IMU, 1 and 2 points.
-    """
+    """number: of the packet, wraps at 65536. of_imu: whether it holds a sample of the IMU, not points."""
 
-    count: int
     number: int
-    kind: int
+    of_imu: bool
     stamp_ns: int
 
 
@@ -71,17 +68,13 @@ def read_header(packet: bytes) -> LivoxHeader | None:
     size = _SAMPLE.size if kind == _IMU_KIND else _MEASURED[kind][0].itemsize if kind in _MEASURED else -1
     if version or length != len(packet) or not count or HEADER_BYTES + count * size != length or stamp >= _FAR_NS:
         return None
-    return LivoxHeader(count, number, kind, stamp)
-
-
-def is_points(header: LivoxHeader) -> bool:
-    return header.kind != _IMU_KIND
+    return LivoxHeader(number, kind == _IMU_KIND, stamp)
 
 
 def read_imu(packet: bytes) -> tuple[int, Vector, Vector] | None:
     """Time ns, rad/s and m/s^2 of a sample; None if it is none."""
     header = read_header(packet)
-    if header is None or is_points(header):
+    if header is None or not header.of_imu:
         return None
     values = _SAMPLE.unpack_from(packet, HEADER_BYTES)
     gx, gy, gz = values[:3]
