@@ -115,3 +115,14 @@ AIRY = Model(
     index_at=12,
 )
 """Its nominal elevations are evenly spaced; each unit states its own."""
+
+
+def rays(elevation: F64, azimuth: F64) -> F64:
+    """(n, 3) unit vectors at these elevations above the base plane and azimuths (n,), rad."""
+    level = np.cos(elevation)
+    return np.column_stack([level * np.cos(azimuth), -level * np.sin(azimuth), np.sin(elevation)])
+
+
+def levers(azimuth: F64, radial: float, height: float) -> F64:
+    """(n, 3) m, where lasers are at these azimuths (n,) of the head, rad."""
+    return np.column_stack([radial * np.cos(azimuth), -radial * np.sin(azimuth), np.full(len(azimuth), height)])

@@ -11,7 +11,7 @@ import numpy as np
 
 from app.sensors.live.difop import NOMINAL, ChannelAngles
 from app.sensors.live.msop import TURN, Firings
-from app.sensors.robosense import BPEARL, Model
+from app.sensors.robosense import BPEARL, Model, levers, rays
 from app.slam.errors import HemislamError
 from app.slam.types import F64, I64, Scan
 
@@ -45,10 +45,10 @@ def firings_of(scan: Scan, calibration: ChannelAngles = NOMINAL, model: Model = 
 
     points = scan.points.astype(np.float64)
     head = np.radians(azimuth[block] / _CENTI)
-    lever = np.column_stack([model.rx * np.cos(head), -model.rx * np.sin(head), np.full(len(head), model.rz)])
+    lever = levers(head, model.rx, model.rz)
     elevation = np.radians(calibration.elevations_deg[channel])
     at = head + np.radians(turn.step_deg * turn.share + calibration.horizontal_deg[channel])
-    ray = np.column_stack([np.cos(elevation) * np.cos(at), -np.cos(elevation) * np.sin(at), np.sin(elevation)])
+    ray = rays(elevation, at)
     count = np.rint(np.linalg.norm(points - lever, axis=1) / model.range_step)
     misfit = float(
         np.percentile(np.linalg.norm(lever + (count * model.range_step)[:, None] * ray - points, axis=1), 95)
@@ -85,9 +85,7 @@ def fit_angles(scans: list[Scan], model: Model = BPEARL, rate_hz: int = 10) -> C
         turn = _turn(scan, nominal, model, rate_hz)
         head = np.radians(turn.start_deg + turn.step_deg * turn.block)
         starts.append(float(_wrapped(turn.start_deg)))
-        x = scan.points[:, 0] - model.rx * np.cos(head)
-        y = scan.points[:, 1] + model.rx * np.sin(head)
-        z = scan.points[:, 2] - model.rz
+        x, y, z = (scan.points - levers(head, model.rx, model.rz)).T
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
         aside = _wrapped(np.degrees(np.arctan2(-y, x) - head) - turn.step_deg * turn.share)
         far = np.linalg.norm(scan.points, axis=1) > 1.0

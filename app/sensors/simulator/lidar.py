@@ -11,6 +11,8 @@ from app.sensors.robosense import (
     RATED_RANGE_M,
     RATED_REFLECTIVITY,
     Model,
+    levers,
+    rays,
 )
 from app.sensors.simulator.imperfections import Unit
 from app.sensors.simulator.raycast import Raycaster
@@ -65,14 +67,10 @@ def turning(
     offsets_ns = (blocks_ns[:, None] + firing_ns).ravel()
     head = np.asarray(2 * np.pi * rate_hz * 1e-9 * offsets_ns, np.float64)
     along, up = head + np.tile(azimuth, len(blocks_ns)), np.tile(elevation, len(blocks_ns))
-    directions = np.column_stack([np.cos(up) * np.cos(along), -np.cos(up) * np.sin(along), np.sin(up)])
     rings = np.tile(np.argsort(np.argsort(elevation)).astype(np.uint16), len(blocks_ns))
-    return Pattern(offsets_ns, directions, levers(head, radial, height), rings, blocks_ns, block_ns, len(elevation))
-
-
-def levers(azimuth: F64, radial: float, height: float) -> F64:
-    """(n, 3) m, where lasers are at these azimuths (n,) of the head."""
-    return np.column_stack([radial * np.cos(azimuth), -radial * np.sin(azimuth), np.full(len(azimuth), height)])
+    return Pattern(
+        offsets_ns, rays(up, along), levers(head, radial, height), rings, blocks_ns, block_ns, len(elevation)
+    )
 
 
 @dataclass(frozen=True, slots=True)
