@@ -157,12 +157,8 @@ def _hall(mesh: MeshBuilder, rng: np.random.Generator) -> None:
         size = rng.uniform(0.8, 1.7), rng.uniform(0.9, 1.5)
         mesh.box((x, far - 0.2, FLOOR + 1.8), (size[0] + 0.2, 0.06, size[1] + 0.2), 0.3)
         mesh.box((x, far - 0.24, FLOOR + 1.8), (size[0], 0.06, size[1]), rng.uniform(0.15, 0.9))
-    for x, y in ((0.0, 11.4), (-6.8, 13.6), (6.8, 13.6), (0.0, 15.8)):  # sculptures
-        mesh.box((x, y, FLOOR + 0.45), (0.7, 0.7, 0.9), 0.7, rng.uniform(0, 0.6))
-        for z in (1.15, 1.55, 1.85):
-            shift = rng.uniform(-0.08, 0.08, 2)
-            radii = rng.uniform(0.14, 0.3, 3) * (2.2 - z)
-            mesh.ellipsoid((x + shift[0], y + shift[1], FLOOR + z), radii + 0.08, 0.75, rng.uniform(0, np.pi))
+    for x, y in ((0.0, 11.4), (-6.8, 13.6), (6.8, 13.6), (0.0, 15.8)):
+        props.sculpture(mesh, (x, y, FLOOR), rng)
     for x in (-2.2, 2.2):
         props.bench(mesh, (x, 17.0, FLOOR), -np.pi / 2)
 

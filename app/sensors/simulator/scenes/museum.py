@@ -108,12 +108,8 @@ def _hall(mesh: MeshBuilder, rng: np.random.Generator) -> None:
         size = rng.uniform(0.7, 1.6), rng.uniform(0.8, 1.4)
         mesh.box((x, y1 - 0.2, 1.7), (size[0] + 0.16, 0.05, size[1] + 0.16), 0.3)
         mesh.box((x, y1 - 0.23, 1.7), (size[0], 0.05, size[1]), rng.uniform(0.15, 0.9))
-    for x, y in ((-1.3, 8.5), (1.3, 12.4), (-7.3, 13.6), (7.3, 13.6)):  # sculptures
-        mesh.box((x, y, 0.45), (0.7, 0.7, 0.9), 0.7, rng.uniform(0, 0.6))
-        for z in (1.15, 1.55, 1.85):
-            shift = rng.uniform(-0.08, 0.08, 2)
-            radii = rng.uniform(0.14, 0.3, 3) * (2.2 - z)
-            mesh.ellipsoid((x + shift[0], y + shift[1], z), radii + 0.08, 0.75, rng.uniform(0, np.pi))
+    for x, y in ((-1.3, 8.5), (1.3, 12.4), (-7.3, 13.6), (7.3, 13.6)):
+        props.sculpture(mesh, (x, y, 0.0), rng)
     for x, y in ((1.3, 8.4), (-1.3, 12.3), (7.4, 9.6)):  # show cases
         mesh.box((x, y, 0.4), (1.1, 0.7, 0.8), 0.3)
         mesh.ellipsoid((x, y, 0.95), (0.2, 0.14, 0.15), 0.7)

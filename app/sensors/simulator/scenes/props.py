@@ -102,9 +102,9 @@ def shelf(
             y += thick + (0.0 if rng.random() < 0.8 else 0.15)
 
 
-def sofa(mesh: MeshBuilder, at: Triple, yaw: float = 0.0, width: float = 1.9) -> None:
+def sofa(mesh: MeshBuilder, at: Triple, yaw: float = 0.0) -> None:
     """Its back is at -x."""
-    p = _place(at, yaw)
+    p, width = _place(at, yaw), 1.9
     mesh.box(p(0, 0, 0.22), (0.85, width, 0.44), 0.3, yaw)
     mesh.box(p(-0.36, 0, 0.55), (0.2, width, 0.5), 0.3, yaw)
     mesh.boxes([p(0, y, 0.32) for y in (-width / 2, width / 2)], (0.85, 0.18, 0.64), 0.28, yaw)
@@ -118,6 +118,16 @@ def plant(mesh: MeshBuilder, at: Triple, rng: np.random.Generator) -> None:
 def extinguisher(mesh: MeshBuilder, at: Triple) -> None:
     mesh.cylinder((at[0], at[1], at[2] + 0.5), 0.08, 0.5, 0.6)
     mesh.cylinder((at[0], at[1], at[2] + 1.0), 0.03, 0.1, 0.2)
+
+
+def sculpture(mesh: MeshBuilder, at: Triple, rng: np.random.Generator) -> None:
+    """Three ellipsoids on a plinth."""
+    x, y, floor = at
+    mesh.box((x, y, floor + 0.45), (0.7, 0.7, 0.9), 0.7, rng.uniform(0, 0.6))
+    for z in (1.15, 1.55, 1.85):
+        shift = rng.uniform(-0.08, 0.08, 2)
+        radii = rng.uniform(0.14, 0.3, 3) * (2.2 - z)
+        mesh.ellipsoid((x + shift[0], y + shift[1], floor + z), radii + 0.08, 0.75, rng.uniform(0, np.pi))
 
 
 def door_leaf(mesh: MeshBuilder, hinge: Triple, yaw: float, width: float = 0.9, height: float = 2.1) -> None:
