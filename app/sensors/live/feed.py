@@ -15,6 +15,7 @@ import numpy as np
 
 from app.sensors import ros
 from app.sensors.live import livox_udp
+from app.sensors.live.clock import ClockMap
 from app.sensors.live.devices import DEVICES
 from app.sensors.live.difop import ChannelAngles, Difop, read_angles, write_difop
 from app.sensors.live.firings import firings_of, fit_angles, rate_of
@@ -34,6 +35,8 @@ from app.slam.types import F64, Scan
 
 LIDAR, DEVICE, IMU = 0, 1, 2
 _DEVICE_PERIOD_NS = 1_000_000_000
+_AFTER_NS = 1_000_000
+"""A packet is sent at most this long after the last point of its scan."""
 _FITTED = 5
 """Scans from which the unit's angles are read."""
 
@@ -105,7 +108,7 @@ def packets_of(
     angles: ChannelAngles | None = None,
     pose: F64 | None = None,
 ) -> Iterator[Sent]:
-    """Everything that the sensors would have sent, in order of time.
+    """Everything that the sensors would have sent, in order of time. A wrong stamp is sent when it was logged.
 
     pose: (4, 4) T_imu_lidar that an Airy states.
 
@@ -116,31 +119,41 @@ def packets_of(
     sensor = _Sensor(recording, model, angles, pose)
     waiting: list[Sent] = []
     by_time = attrgetter("time_ns")
+    lidar, imu = ClockMap(), ClockMap()
     samples = count()
-    stated_ns = 0
+    stated_ns = shift_ns = before_ns = end_ns = 0
+
+    def packets(made: list[tuple[int, bytes]]) -> list[Sent]:
+        """Those of a scan, and of the end of the one before, which ended at `before_ns` and may have a wrong stamp."""
+        last_ns = end_ns + _AFTER_NS
+        return [Sent(min(max(time_ns + shift_ns, before_ns), last_ns), LIDAR, packet) for time_ns, packet in made]
+
     for entry in recording.entries():
         if isinstance(entry, ScanEntry):
             scan = entry.scan
-            if scan.stamp_ns >= stop_ns + 3e8:
-                break
-            if not isinstance(scan, Scan) or scan.stamp_ns >= stop_ns:
+            if not isinstance(scan, Scan):
                 continue
-            waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in sensor.add(scan)]
-            if scan.stamp_ns - stated_ns > _DEVICE_PERIOD_NS and (said := sensor.settings(scan.stamp_ns)) is not None:
-                stated_ns = scan.stamp_ns
+            mapped_ns = lidar.map(scan.end_ns, entry.log_ns)
+            begin_ns = mapped_ns - (scan.end_ns - scan.stamp_ns)
+            if begin_ns >= stop_ns + 3e8:
+                break
+            if begin_ns >= stop_ns:
+                continue
+            before_ns, end_ns, shift_ns = end_ns, mapped_ns, mapped_ns - scan.end_ns
+            waiting += packets(sensor.add(scan))
+            if begin_ns - stated_ns > _DEVICE_PERIOD_NS and (said := sensor.settings(scan.stamp_ns)) is not None:
+                stated_ns = begin_ns
                 waiting.append(Sent(stated_ns, DEVICE, said))
             waiting.sort(key=by_time)
-            due = bisect.bisect_right(waiting, scan.end_ns, key=by_time)
+            due = bisect.bisect_right(waiting, end_ns, key=by_time)
             yield from waiting[:due]
             del waiting[:due]
-        elif (
-            isinstance(entry, ImuEntry)
-            and entry.stamp_ns < stop_ns + 2e8
-            and np.isfinite(entry.gyro + entry.accel).all()
-        ):
-            sample = ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)
-            waiting.append(Sent(entry.stamp_ns, IMU, sensor.imu(sample)))
-    waiting += [Sent(time_ns, LIDAR, packet) for time_ns, packet in sensor.flush()]
+        elif isinstance(entry, ImuEntry) and np.isfinite(entry.gyro + entry.accel).all():
+            time_ns = imu.map(entry.stamp_ns, entry.log_ns)
+            if time_ns < stop_ns + 2e8:
+                sample = ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)
+                waiting.append(Sent(time_ns, IMU, sensor.imu(sample)))
+    waiting += packets(sensor.flush())
     yield from sorted(waiting, key=by_time)
 
 

@@ -4,11 +4,13 @@ Tests app/sensors/live/feed.py, app/sensors/live/urls.py.
 """
 
 import contextlib
+import itertools
 import math
 import socket
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ from app.sensors.live.source import Event
 from app.sensors.live.urls import open_live, parse_address
 from app.sensors.livox import DRIVERS
 from app.sensors.presets import resolve_params
-from app.sensors.recording import open_recording
+from app.sensors.recording import ImuEntry, ScanEntry, open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import Measurement, Scan
@@ -148,6 +150,25 @@ def test_a_recording_without_an_imu_goes_through_foxglove_too(tmp_path: Path) ->
         while source.state().counters.frames < 20 and time.monotonic() < deadline:
             source.poll(0.05)
         assert source.state().counters.frames == 20
+
+
+@pytest.mark.parametrize("kind", [ImuEntry, ScanEntry])
+def test_one_wrong_stamp_delays_nothing(params: Params, monkeypatch: pytest.MonkeyPatch, kind: type) -> None:
+    """It is an hour ahead: played by the stamps alone, everything after it would wait for an hour."""
+    with open_recording(SAMPLE, params) as recording:
+        first, *rest = list(itertools.islice(recording.entries(), 900))
+        at = [k for k, entry in enumerate(rest) if isinstance(entry, kind)][15]
+        entry, hour_ns = rest[at], 3600 * 10**9
+        if isinstance(entry, ImuEntry):
+            rest[at] = replace(entry, stamp_ns=entry.stamp_ns + hour_ns)
+        elif isinstance(entry, ScanEntry):
+            rest[at] = replace(entry, scan=replace(entry.scan, stamp_ns=entry.scan.stamp_ns + hour_ns))
+        plain = list(packets_of(recording, SECONDS))
+        monkeypatch.setattr(recording, "entries", lambda: iter([first, *rest]))
+        sent = list(packets_of(recording, SECONDS))
+    assert len(sent) == pytest.approx(len(plain), abs=5)
+    assert max(np.diff([one.time_ns for one in sent])) < 200_000_000
+    assert sent[-1].time_ns == pytest.approx(plain[-1].time_ns, abs=200_000_000)
 
 
 def test_another_lidars_recording_is_no_rsbpearls(shared_data: Path) -> None:
