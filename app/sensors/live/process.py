@@ -66,11 +66,6 @@ class LiveProcess(AbstractContextManager["LiveProcess"]):
         self._watcher.start()
 
     @property
-    def alive(self) -> bool:
-        """Whether there is a process, or will be again."""
-        return self._watcher.is_alive()
-
-    @property
     def pid(self) -> int | None:
         return self._child.pid
 

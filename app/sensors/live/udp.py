@@ -116,7 +116,6 @@ class PacketReceiver:
             for opened in self._sockets:
                 opened.close()
             raise
-        self.ports = [int(made.getsockname()[1]) for made in self._sockets]
         if self._decoder is not None:
             self._decoder.warm_up()
         self._model, self._models = model, device.models
@@ -245,7 +244,6 @@ class ImuReceiver:
 
     def __init__(self, host: str, port: int) -> None:
         self._socket = open_socket(host, port)
-        self.port = int(self._socket.getsockname()[1])
         self._order = ImuOrder()
 
     def __call__(self, intake: Intake, stop: threading.Event) -> None:

@@ -74,7 +74,7 @@ def test_signals_to_the_whole_group_leave_it_to_its_owner_to_end_the_recording(t
     with LiveProcess(wire.url, Params(), wire.imu_url, record) as process:
         client = LiveClient(process.address)
         pid = process.pid
-        assert pid is not None and process.alive
+        assert pid is not None and not process.address.ended()
         for number in (signal.SIGINT, signal.SIGTERM):
             os.kill(pid, number)
         for _ in range(5):
@@ -84,5 +84,5 @@ def test_signals_to_the_whole_group_leave_it_to_its_owner_to_end_the_recording(t
         with pytest.raises(HemislamError, match="has ended"):
             client.poll(0.1)
         client.close()
-        assert not process.alive
+        assert process.address.ended()
     assert record.read_bytes().endswith(b"\x89MCAP0\r\n")
