@@ -77,19 +77,20 @@ class _Appearance:
         )
 
 
-_APPEARANCES = {
-    "mid360": _Appearance(CUSTOM_MSGS, frozenset(), (), (-9, 90), (40, 56)),
-    "airy": _Appearance((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (96,), (-3, 20), (60, 91)),
-    "jt128": _Appearance((POINT_CLOUD_2.name,), frozenset({"ring", "timestamp"}), (128,), (-8, 20), (60, 91)),
-    "ouster": _Appearance(
-        (POINT_CLOUD_2.name,), frozenset({"ring", "t", "reflectivity"}), (32, 64, 128), (-90, 0), (0, 91)
-    ),
-}
+_POINTS = (POINT_CLOUD_2.name,)
+_APPEARANCES = (
+    ("mid360", _Appearance(CUSTOM_MSGS, frozenset(), (), (-9, 90), (40, 56))),
+    ("mid360", _Appearance(_POINTS, frozenset({"tag", "line"}), (), (-9, 90), (40, 56))),
+    ("airy", _Appearance(_POINTS, frozenset({"ring", "timestamp"}), (96,), (-3, 20), (60, 91))),
+    ("jt128", _Appearance(_POINTS, frozenset({"ring", "timestamp"}), (128,), (-8, 20), (60, 91))),
+    ("ouster", _Appearance(_POINTS, frozenset({"ring", "t", "reflectivity"}), (32, 64, 128), (-90, 0), (0, 91))),
+)
+"""Of each preset; that of a scanner whose driver sends several types of message is listed for each."""
 
 
 def preset_for(kind: str, probe: Probe) -> str:
     """The preset of the scanner whose clouds are of this type and look like this one; "" if none is known."""
-    return next((name for name, appearance in _APPEARANCES.items() if appearance.fits(kind, probe)), "")
+    return next((name for name, appearance in _APPEARANCES if appearance.fits(kind, probe)), "")
 
 
 def built_in_mounting(preset: str, imu_topic: str) -> dict[str, Any]:

@@ -12,14 +12,15 @@ import pytest
 
 from app.sensors.doctor import examine
 from app.sensors.presets import resolve_params
-from app.sensors.recording import open_recording
+from app.sensors.recording import ImuEntry, ScanEntry, open_recording
+from app.sensors.ros import Layout, RecordingWriter, points_message, serialised
 from app.sensors.simulator import simulate
 from app.slam.engine import Engine
 from app.slam.errors import HemislamError
 from app.slam.metrics import GroundScore, ate
 from app.slam.params import Params
 from app.slam.trajectory import Trajectory, read_tum
-from app.slam.types import Measurement
+from app.slam.types import Measurement, Scan
 
 FOLDERS = {"mid360": "livox", "jt128": "hesai"}
 """Of the makers' tables, under ../shared/data/sensors."""
@@ -64,6 +65,29 @@ def test_a_scanner_is_recognised_and_its_preset_alone_maps_the_walk(make: Make, 
     assert error.position.max < 0.01  # m
     if scanner != "mid360":  # CustomMsg has no labels
         assert score.f1 > 0.9
+
+
+def as_point_cloud_2(scan: Scan) -> bytes:
+    """As livox_ros_driver2 sends it with xfer_format 0."""
+    names = ["x", "y", "z", "intensity", "tag", "line", "timestamp"]
+    points = np.zeros(len(scan), list(zip(names, ["<f4"] * 4 + ["u1"] * 2 + ["<f8"], strict=True)))
+    points["x"], points["y"], points["z"] = scan.points.T
+    points["timestamp"] = scan.stamp_ns + scan.offsets_ns.astype(np.int64)
+    return serialised(points_message(points, scan.stamp_ns, "livox_frame"))
+
+
+def test_a_mid360_is_recognised_by_its_point_cloud_2_too(make: Make, tmp_path: Path) -> None:
+    with open_recording(make("mid360"), Params()) as recording, (tmp_path / "walk.mcap").open("wb") as file:
+        writer = RecordingWriter(file, Layout("/livox/lidar", "/livox/imu", encode=as_point_cloud_2))
+        for entry in recording.entries():
+            if isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan):
+                writer.add_scan(entry.scan, entry.log_ns)
+            elif isinstance(entry, ImuEntry):
+                writer.add_imu(entry.stamp_ns, entry.gyro, entry.accel, entry.log_ns)
+        writer.finish()
+    with open_recording(tmp_path / "walk.mcap", Params()) as recording:
+        assert "--preset mid360" in [finding.option for finding in recording.findings]
+        assert [f.subject for f in recording.findings if f.verdict == "needs you"] == ["mount"]
 
 
 def test_a_bpearl_is_not_taken_for_a_scanner_with_an_imu_of_its_own(make: Make) -> None:
