@@ -20,7 +20,7 @@ from app.slam.sections import ImuParams
 from app.slam.types import I64, DroppedScan, ImuSamples, Measurement, Samples, Scan, Vector
 
 OUTAGE_NS = 1_000_000_000
-"""The first sample, and one that comes more than this after the one before, must be confirmed by the next."""
+"""The first sample, and the first after a gap, must be confirmed by one that comes within this after it."""
 
 MAX_WAITING = 64
 """Scans that wait for IMU samples at most; bounds the memory when the IMU falls silent."""
@@ -89,7 +89,7 @@ class Sequencer:
     _told_silence_ns: int = -1
     """Last sample before the gap, and before the silence without an end, that was told last."""
     _suspect: tuple[int, tuple[float, ...]] | None = None
-    """The first sample, or one stamped far ahead of the one before: a wrong stamp, unless the next goes on from it."""
+    """The first sample, or the first after a gap: a wrong stamp, unless the next goes on from it."""
     _usual: list[float] = field(default_factory=lambda: [0.0, 0.0])
     """How far samples usually are from the line between their neighbours: rad/s, m/s^2."""
     _begun: bool = False
@@ -130,7 +130,7 @@ class Sequencer:
         newest = self._stamps[-1] if self._stamps else None
         suspect, self._suspect = self._suspect, None
         confirmed = suspect is not None and 0 < stamp_ns - suspect[0] <= OUTAGE_NS
-        doubtful = newest is None or stamp_ns > newest + OUTAGE_NS
+        doubtful = newest is None or stamp_ns > newest + min(self.limits.max_gap * 1e9, OUTAGE_NS)
         if suspect is not None and doubtful and confirmed:
             self._append(*suspect)
         elif suspect is not None and suspect[0] != stamp_ns:

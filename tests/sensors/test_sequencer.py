@@ -257,15 +257,17 @@ def test_repeated_and_reversed_samples_are_left_out_and_reported_once() -> None:
     assert (sequencer.counts.imu_duplicates, sequencer.counts.imu_back_steps) == (1, 1)
 
 
-def test_one_sample_stamped_far_ahead_does_not_silence_the_rest() -> None:
+@pytest.mark.parametrize("ahead_ms", [9_000_000, 900, 200])
+def test_one_sample_stamped_far_ahead_does_not_silence_the_rest(ahead_ms: int) -> None:
     sequencer = Sequencer(ImuParams())
-    for at in [*samples(0, 50), 9_000_000, *samples(60, 210)]:
+    for at in [*samples(0, 50), ahead_ms, *samples(60, 210)]:
         push(sequencer, at)
     sequencer.add_scan(scan(0))
     sequencer.add_scan(scan(100))
     first, second = sequencer.ready()
     assert stamps(first) == samples(0, 100) and stamps(second) == samples(100, 200)
-    assert isinstance(first, Measurement) and "stamped far from" in first.notices[0]
+    assert isinstance(first, Measurement) and len(first.notices) == 1 and "stamped far from" in first.notices[0]
+    assert (sequencer.counts.imu_far_off, sequencer.counts.imu_behind, sequencer.counts.imu_gaps) == (1, 0, 0)
 
 
 @pytest.mark.parametrize("wrong_ms", [-1_000_000, 60_000])
