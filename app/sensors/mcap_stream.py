@@ -1,4 +1,6 @@
-"""Reads MCAP files from front to back, for those that rosbags refuses: cut off, or without a ROS 2 profile."""
+"""Reads MCAP files from front to back: those that rosbags refuses, cut off or without a ROS 2 profile, and those that
+it would mix up, since it sorts by log time and the recorder's clock was set back.
+"""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -14,6 +16,9 @@ from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type
 from app.sensors.unpacking import LIMIT, UNPACK, TooLarge
 from app.slam.errors import printable
 
+SET_BACK_NS = 500_000_000
+"""Log times on one topic that step back by more do so because the recorder's clock was set."""
+
 
 class McapStream:
     """Topics and messages of the pieces of a recording, as far as each reaches. Needs no index, no summary and no end.
@@ -21,6 +26,8 @@ class McapStream:
     Attributes:
         counts: topic -> (type as in ROS 2, number of messages). start_ns, end_ns: log times.
         cut: the pieces without an end, in order of time.
+        set_back: (number of a message, ns): where the recorder's clock was set back, and by how much. From there on
+            this is added to log times, so that they go on.
     """
 
     by_log_time = False
@@ -30,12 +37,20 @@ class McapStream:
         self._deserialiser = Deserialiser()
         self.counts: dict[str, tuple[str, int]] = {}
         self.cut: list[Path] = []
+        self.set_back: list[tuple[int, int]] = []
         self._pieces = sorted(pieces, key=self._begin)
-        times: tuple[int, int] | None = None
-        for topic, kind, log_ns, _, _ in self._records():
+        first_ns, last_ns, added_ns = 0, 0, 0
+        last: dict[str, int] = {}
+        for number, (topic, kind, log_ns, _, _) in enumerate(self._all_records()):
             self.counts[topic] = (kind, self.counts.get(topic, (kind, 0))[1] + 1)
-            times = (min(times[0], log_ns), max(times[1], log_ns)) if times else (log_ns, log_ns)
-        self.start_ns, self.end_ns = times or (0, 0)
+            if log_ns + added_ns < last.get(topic, log_ns + added_ns) - SET_BACK_NS:
+                self.set_back.append((number, last_ns + 1 - log_ns - added_ns))
+                added_ns += self.set_back[-1][1]
+            log_ns += added_ns
+            first_ns = min(first_ns or log_ns, log_ns)
+            last_ns = max(last_ns, log_ns)
+            last[topic] = log_ns
+        self.start_ns, self.end_ns = first_ns, last_ns
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
         """(topic, log time ns, deserialised message), in the order of the file.
@@ -57,6 +72,13 @@ class McapStream:
         return next((log_ns for _, _, log_ns, _, _ in self._records_of(piece)), 0)
 
     def _records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
+        """With log times that go on where the clock was set back."""
+        added_ns, set_back = 0, dict(self.set_back)
+        for number, (topic, kind, log_ns, encoding, data) in enumerate(self._all_records()):
+            added_ns += set_back.get(number, 0)
+            yield topic, kind, log_ns + added_ns, encoding, data
+
+    def _all_records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
         for piece in self._pieces:
             yield from self._records_of(piece)
 

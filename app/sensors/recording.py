@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,19 @@ from app.sensors.clocks import clock_finding, is_copy, overlap_finding
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.distances import distance_findings
 from app.sensors.findings import Finding
-from app.sensors.imu_units import AS_RECORDED, gravity_findings, settle_imu
+from app.sensors.imu_units import AS_RECORDED, ImuProbe, gravity_findings, settle_imu
 from app.sensors.layout import settle_cloud
+from app.sensors.leaps import (
+    AROUND_NS,
+    Leaps,
+    Times,
+    added_ns,
+    all_added_ns,
+    find_leaps,
+    leap_sentences,
+    same_motion,
+    same_view,
+)
 from app.sensors.navsat import fix_of, navsat_topic
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
@@ -94,20 +105,27 @@ class Recording(AbstractContextManager["Recording"]):
         probes, probe_findings = probe_clouds(source, lidar)
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
         probes, scans = self._decode_probes(probes, cloud_findings)
-        self.start_ns = scans[0].stamp_ns
-        self._log_after_stamp_ns = probes[0].log_ns - self.start_ns
-        self.duration_s = max((source.end_ns - probes[0].log_ns) / 1e9, 0.0) + (scans[0].end_ns - self.start_ns) / 1e9
-        scan_times = [(probe.log_ns, scan.stamp_ns, scan.end_ns) for probe, scan in zip(probes, scans, strict=True)]
+        self._look_at_clocks()
+        self.start_ns = scans[0].stamp_ns + added_ns(self._leaps.lidar, probes[0].log_ns)
+        log_start_ns = int(self.log_times(np.array([probes[0].log_ns]))[0])
+        self._log_after_stamp_ns = log_start_ns - self.start_ns
+        self._leaps_told = leap_sentences(self._leaps, log_start_ns)
+        lasts_ns = max(source.end_ns - log_start_ns, 0) + scans[0].end_ns - scans[0].stamp_ns
+        self.duration_s = lasts_ns / 1e9
+        scan_times = np.array([(p.log_ns, s.stamp_ns, s.end_ns) for p, s in zip(probes, scans, strict=True)], np.int64)
+        scan_times[:, 1:] += all_added_ns(self._leaps.lidar, scan_times[:, 0])[:, None]
+        scan_times[:, 0] = self.log_times(scan_times[:, 0])
         before: list[Scan | None] = [None, *scans[:-1]]
-        once = [t for t, scan, last in zip(scan_times, scans, before, strict=True) if not is_copy(scan, last)]
+        once = [not is_copy(scan, last) for scan, last in zip(scans, before, strict=True)]
         self._clocks = Finding("clocks", "fine", "there is one only")
         self.preset = preset_for(lidar.type, probes[0])
-        imu_findings = self._look_at_imu(np.array(scan_times, np.int64))
+        imu_findings = self._look_at_imu(scan_times)
         self.findings: tuple[Finding, ...] = (
             *source.findings,
             lidar_finding,
             imu_finding,
-            *overlap_finding(np.array(once, np.int64), self.lidar_topic),
+            *(Finding("clock leap", "corrected", text) for text in self._leaps_told.values()),
+            *overlap_finding(scan_times[once], self.lidar_topic),
             *probe_findings,
             *cloud_findings,
             *line_findings(scans, self.has_lines, params.sensor),
@@ -115,13 +133,44 @@ class Recording(AbstractContextManager["Recording"]):
             *imu_findings,
         )
 
+    def _look_at_clocks(self) -> None:
+        """Whether the IMU's headers carry times, and where clocks leap."""
+        self._imu_stamped, self._imu_units, self._leaps = True, AS_RECORDED, Leaps()
+        self._imu_probe: tuple[ImuProbe, list[Finding]] | None = None
+        if self.imu_topic:
+            offset_s = self.params.recording.imu_time_offset
+            imu, self._imu_stamped, findings = probe_imu(self._source, self.imu_topic, offset_s)
+            self._imu_probe = imu, findings
+
+        def times(topic: str) -> Times:
+            return lambda first_ns, stop_ns: (
+                (entry.log_ns, entry.scan.stamp_ns if isinstance(entry, ScanEntry) else entry.stamp_ns)
+                for entry in self._read((topic,), first_ns, stop_ns, None)
+                if isinstance(entry, ImuEntry) or (isinstance(entry, ScanEntry) and isinstance(entry.scan, Scan))
+            )
+
+        def continues(before_ns: int, after_ns: int) -> bool:
+            entries = list(self._read(topics, before_ns - AROUND_NS, after_ns + AROUND_NS, None))
+            middle_ns = (before_ns + after_ns) // 2
+            parts = [e for e in entries if e.log_ns < middle_ns], [e for e in entries if e.log_ns >= middle_ns]
+            values = [[(*e.gyro, *e.accel) for e in part if isinstance(e, ImuEntry)] for part in parts]
+            scans = [[e.scan for e in part if isinstance(e, ScanEntry) and isinstance(e.scan, Scan)] for part in parts]
+            return same_motion(*map(np.array, values)) and same_view(*scans)
+
+        topics = (self.lidar_topic, self.imu_topic)
+        source = self._source
+        of_imu = times(self.imu_topic) if self.imu_topic else None
+        scans_ns = self.scan_count * self._layout.timing.period_ns
+        self._leaps = find_leaps(times(self.lidar_topic), of_imu, source.start_ns, source.end_ns, scans_ns, continues)
+
     def _look_at_imu(self, scan_times: I64) -> list[Finding]:
         """Settle how its samples are read, by the first ones; `scan_times` as for `clock_finding`."""
-        self._imu_stamped, self._imu_units = True, AS_RECORDED
-        if not self.imu_topic:
+        if self._imu_probe is None:
             return []
         chosen = self.params.recording
-        imu, self._imu_stamped, probe_findings = probe_imu(self._source, self.imu_topic, chosen.imu_time_offset)
+        imu, probe_findings = self._imu_probe
+        bridged = imu.stamps_ns + all_added_ns(self._leaps.imu, imu.log_ns)
+        imu = replace(imu, log_ns=self.log_times(imu.log_ns), stamps_ns=bridged)
         self._imu_units, imu_findings = settle_imu(imu, chosen)
         self._clocks = clock_finding(scan_times, np.column_stack([imu.log_ns, imu.stamps_ns]), chosen.imu_time_offset)
         gravity = gravity_findings(imu, self._imu_units, self.params, self.preset)
@@ -157,18 +206,37 @@ class Recording(AbstractContextManager["Recording"]):
         Raises:
             HemislamError: where the file is damaged.
         """
-        offset, added = self._log_after_stamp_ns, round(self.params.recording.imu_time_offset * 1e9)
-        log_first = None if first_ns is None else first_ns + offset - LOG_MARGIN_NS
-        log_stop = None if stop_ns is None else stop_ns + offset + LOG_MARGIN_NS
+        offset, leaps = self._log_after_stamp_ns, self._leaps
+        log_first = None if first_ns is None else leaps.recorded_ns(first_ns + offset - LOG_MARGIN_NS)
+        log_stop = None if stop_ns is None else leaps.recorded_ns(stop_ns + offset + LOG_MARGIN_NS)
         topics = tuple(filter(None, (self.lidar_topic, self.imu_topic, self.gnss_topic)))
+        return self._read(topics, log_first, log_stop, after)
+
+    def _read(
+        self, topics: tuple[str, ...], log_first: int | None, log_stop: int | None, after: Mark | None
+    ) -> Iterator[ScanEntry | ImuEntry | OtherEntry]:
+        """Entries of some topics that were logged within [log_first, log_stop)."""
+        offset_ns = round(self.params.recording.imu_time_offset * 1e9)
         for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after):
             if topic == self.lidar_topic:
-                yield ScanEntry(log_ns, *read_scan(message, log_ns, self._layout))
+                cloud, scan = read_scan(message, log_ns, self._layout)
+                if added := added_ns(self._leaps.lidar, log_ns):
+                    scan = replace(scan, stamp_ns=scan.stamp_ns + added)
+                yield ScanEntry(log_ns, cloud, scan)
             elif topic == self.gnss_topic:
                 yield OtherEntry(log_ns, fix_of(message))
             else:
                 stamp = stamp_ns(message.header.stamp) if self._imu_stamped else log_ns
+                added = offset_ns + added_ns(self._leaps.imu, log_ns)
                 yield ImuEntry(log_ns, stamp + added, *self._imu_units.apply(*imu_values(message)))
+
+    def log_times(self, recorded_ns: I64) -> I64:
+        """(n,) log times in the file, with the leaps of the recorder's clock bridged."""
+        return recorded_ns + all_added_ns(self._leaps.log, recorded_ns)
+
+    def leaps_told(self, after_ns: int, until_ns: int) -> list[str]:
+        """A sentence for each leap of a clock between two log times in the file."""
+        return [text for at_ns, text in self._leaps_told.items() if after_ns < at_ns <= until_ns]
 
     def fraction_at(self, log_ns: int) -> float:
         """Share of the recording, 0-1, that was logged before."""
@@ -253,6 +321,8 @@ class Measurements(Iterator[Measurement | DroppedScan]):
             yield from sequencer.ready()
             try:
                 for entry in recording.entries(first_ns if start_s > 0 else None, stop_ns, self._message):
+                    for text in recording.leaps_told(self._message.log_ns, entry.log_ns) if self._message else ():
+                        sequencer.notice(text)
                     self._message = Mark.after(self._message, entry.log_ns)
                     if isinstance(entry, ScanEntry):
                         if entry.scan.stamp_ns >= first_ns and (stop_ns is None or entry.scan.stamp_ns < stop_ns):

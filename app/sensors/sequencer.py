@@ -203,6 +203,10 @@ class Sequencer:
             del self._stamps[this], self._values[this]
             self._count("imu_spikes", "an IMU sample is far from those before and after it and was left out")
 
+    def notice(self, text: str) -> None:
+        """Something to tell with the next measurement."""
+        self._notices.append(text)
+
     def add(self, samples: Samples) -> None:
         """Samples of any other sensor. Each goes out once, with the first measurement that ends at or after it.
 

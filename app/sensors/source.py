@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,7 +16,7 @@ from app.sensors.findings import Finding
 from app.sensors.live.capture import SUFFIXES as CAPTURES
 from app.sensors.live.capture import CaptureStream
 from app.sensors.live.pcap import CaptureError
-from app.sensors.mcap_stream import McapStream
+from app.sensors.mcap_stream import SET_BACK_NS, McapStream
 from app.sensors.ouster import OusterStream, metadata_beside
 from app.sensors.ros import Deserialiser
 from app.sensors.unpacking import limit_rosbags
@@ -87,6 +87,17 @@ class RosbagsStream:
             return
         for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
             yield printable(connection.topic), log_ns, self._deserialised(raw, connection.msgtype)
+
+    def may_be_set_back(self) -> bool:
+        """Whether an MCAP's chunks step back in time, as where the recorder's clock was set."""
+        for reader in self._reader.readers:
+            storages = getattr(storage := getattr(reader, "storage", None), "storages", [storage])
+            for chunks in (getattr(storage, "chunks", []) for storage in storages):
+                for before, after in pairwise(sorted(chunks, key=lambda chunk: chunk.chunk_start_offset)):
+                    shared = before.message_index_offsets.keys() & after.message_index_offsets.keys()
+                    if shared and after.message_start_time < before.message_end_time - SET_BACK_NS:
+                        return True
+        return False
 
     def close(self) -> None:
         self._reader.close()
@@ -191,6 +202,10 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         if salvaged is None:
             raise HemislamError(_refusal(path, error)) from error
         return salvaged
+    if reader.may_be_set_back() and (in_order := _in_file_order(path, files)):
+        reader.close()
+        text = "read in the order of the file, since the recorder's clock was set back on the way"
+        return in_order, (Finding("file", "corrected", text),)
     if path.is_dir() and files != [path]:
         if files[0].suffix == ".bag":
             return reader, (Finding("file", "fine", f"{len(files)} .bag file(s), read as one recording"),)
@@ -212,6 +227,15 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
             f"as {path.stem}.json."
         )
     return stream
+
+
+def _in_file_order(path: Path, files: list[Path]) -> McapStream | None:
+    """The files of an MCAP read from front to back, if the recorder's clock was set back on the way."""
+    try:
+        stream = McapStream(sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files)
+    except Exception:  # whatever a damaged file may cause; rosbags reads it
+        return None
+    return stream if stream.set_back else None
 
 
 def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Finding, ...]] | None:
