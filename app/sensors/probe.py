@@ -1,6 +1,8 @@
 """The first messages of a recording: which topics to use, the first clouds and IMU samples."""
 
 from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
 from typing import Any, Literal
 
 import numpy as np
@@ -46,12 +48,34 @@ def choose_topic(source: Source, sensor: Literal["lidar", "imu"], wanted: str) -
         empty = [topic.name for topic in source.topics if topic.type in kinds]
         why = f"no messages on {empty[0]}" if empty else f"no topic of type {' or '.join(kinds)}"
         raise HemislamError(f"{source.path} holds no {content}: {why}; it has {listed}.")
-    chosen = max(candidates, key=lambda topic: topic.messages)  # the first of equals
     if len(candidates) == 1:
-        return chosen, Finding(subject, "fine", f"{chosen.name}, {chosen.messages} messages")
+        return candidates[0], Finding(subject, "fine", f"{candidates[0].name}, {candidates[0].messages} messages")
+    content_of = {topic.name: _content(source, topic) for topic in candidates}
+    fullest = max(content_of.values())
+    chosen = max(candidates, key=lambda topic: (content_of[topic.name], topic.messages))  # the first of equals
     rest = ", ".join(topic.name for topic in candidates if topic is not chosen)
+    if sum(content == fullest for content in content_of.values()) == 1:
+        what = "times or rings" if sensor == "lidar" else "both accelerations and rates"
+        text = f"{chosen.name}, {chosen.messages} messages, the one with the most of {what}; there are also {rest}"
+        return chosen, Finding(subject, "corrected", text, option + rest.split(", ")[0])
     text = f"{chosen.name} has the most messages ({chosen.messages}); there are also {rest}"
     return chosen, Finding(subject, "needs you", text, option + chosen.name)
+
+
+def _content(source: Source, topic: Topic) -> int:
+    """How much of what is needed a topic's first messages hold: a depth camera's clouds, or those that a program has
+    registered, have neither times nor rings, and some IMUs send accelerations and rates on two topics."""
+    first = [message for _, _, message in islice(_readable(source.messages((topic.name,))), 5)]
+    if topic.type == IMU:
+        accel, gyro = (np.array([imu_values(message)[part] for message in first]) for part in (1, 0))
+        return int(accel.any()) + int(gyro.any())
+    kind = CLOUD_TYPES[topic.type]
+    names: set[str] = set()
+    for message in first:
+        with suppress(CloudError):
+            names |= {name.lower() for name in kind.read(message).fields}
+    fixed = kind.time_unit != "auto"  # the type is a scanner's own
+    return 2 if fixed else sum(not names.isdisjoint(usual) for usual in (kind.times, kind.rings))
 
 
 def probe_clouds(source: Source, topic: Topic) -> tuple[list[Probe], list[Finding]]:

@@ -206,6 +206,13 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         reader.close()
         text = "read in the order of the file, since the recorder's clock was set back on the way"
         return in_order, (Finding("file", "corrected", text),)
+    if unmerged := [wal for file in files for wal in _write_ahead_logs(file)]:
+        database = str(unmerged[0]).removesuffix("-wal")
+        text = (
+            f"{unmerged[0].name} holds messages that are not yet in the database and are not read, as after a recorder "
+            f"that was killed; `sqlite3 {database} 'PRAGMA wal_checkpoint(TRUNCATE)'` moves them there"
+        )
+        return reader, (Finding("file", "needs you", text),)
     if path.is_dir() and files != [path]:
         if files[0].suffix == ".bag":
             return reader, (Finding("file", "fine", f"{len(files)} .bag file(s), read as one recording"),)
@@ -227,6 +234,12 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
             f"as {path.stem}.json."
         )
     return stream
+
+
+def _write_ahead_logs(path: Path) -> list[Path]:
+    """The -wal files of SQLite, beside a database or in a folder, that are not empty."""
+    found = sorted(path.glob("*.db3-wal")) if path.is_dir() else [path.with_name(f"{path.name}-wal")]
+    return [wal for wal in found if wal.is_file() and wal.stat().st_size]
 
 
 def _in_file_order(path: Path, files: list[Path]) -> McapStream | None:
@@ -287,6 +300,11 @@ def _recording_files(path: Path) -> list[Path]:
             whole = (path.parent / "metadata.yaml").is_file()
             advice = f"open its folder {path.parent}" if whole else f"`unzstd {path}` unpacks it"
             raise HemislamError(f"{path} is compressed as a whole file; {advice}.")
+        if path.name.endswith(".bag.active"):
+            raise HemislamError(
+                f"{path} was left by a recorder that was killed; `rosbag reindex {path}` repairs it, then rename it to "
+                f"{path.stem}."
+            )
         if path.suffix.lower() not in SUFFIXES:
             raise HemislamError(f"{path} does not look like a recording; hemislam reads {_KINDS}.")
         if path.stat().st_size == 0:

@@ -130,6 +130,22 @@ def test_files_compressed_as_a_whole_name_the_command_that_unpacks_them(tmp_path
     assert f"`unzstd {file}`" in refusal(folder)
 
 
+def test_a_bag_that_is_still_active_names_the_command_that_repairs_it(tmp_path: Path) -> None:
+    path = tmp_path / "walk.bag.active"
+    path.write_bytes(b"#ROSBAG V2.0" + bytes(5000))
+    assert f"`rosbag reindex {path}` repairs it, then rename it to walk.bag" in refusal(path)
+
+
+@pytest.mark.parametrize("container", ["bare-db3", "sqlite3"])
+def test_messages_left_in_the_write_ahead_log_of_sqlite_are_named(tmp_path: Path, container: str) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=4, columns=4), container)
+    database = path if path.is_file() else next(path.glob("*.db3"))
+    database.with_name(f"{database.name}-wal").write_bytes(bytes(100))
+    with open_recording(path, Params()) as recording:
+        (told,) = [finding for finding in recording.findings if finding.subject == "file"]
+    assert told.verdict == "needs you" and f"`sqlite3 {database} 'PRAGMA wal_checkpoint(TRUNCATE)'`" in told.text
+
+
 def test_an_mcap_without_the_ros2_profile_is_read_all_the_same(tmp_path: Path) -> None:
     path = rig.write(tmp_path / "walk", rig.walk(turns=4, columns=12), "small-chunks")
     path.write_bytes(path.read_bytes().replace(b"\x04\x00\x00\x00ros2", b"\x04\x00\x00\x00xxxx", 1))

@@ -187,6 +187,27 @@ def test_of_several_topics_the_busiest_is_used_and_the_others_are_named(tmp_path
         assert recording.scan_count == 2
 
 
+def test_the_scanner_is_preferred_to_a_depth_camera_and_a_whole_imu_to_a_gyroscope(tmp_path: Path) -> None:
+    plain = rig.Layout(fields=[("x", "f4", "x"), ("y", "f4", "y"), ("z", "f4", "z")])
+    others = [
+        ("/camera/points", log + late, rig.message(rig.turn(0, 2), plain))
+        for topic, log, _ in rig.walk(turns=4, columns=2)
+        for late in (1, 2, 3)
+        if topic == "/points"
+    ] + [
+        ("/camera/gyro", log + late, rig.imu(log, (0, 0, 0), (0.1, 0, 0)))
+        for topic, log, _ in rig.walk(turns=4, columns=2)
+        for late in (1, 2)
+        if topic == "/imu"
+    ]
+    entries = sorted([*rig.walk(turns=4, columns=12), *others], key=lambda entry: entry[1])
+    with open_recording(rig.write(tmp_path / "walk", entries), Params()) as recording:
+        assert (recording.lidar_topic, recording.imu_topic) == ("/points", "/imu")
+        chosen = {finding.subject: finding for finding in recording.findings if "topic" in finding.subject}
+    assert {finding.verdict for finding in chosen.values()} == {"corrected"}
+    assert "/camera/points" in chosen["lidar topic"].text and "/camera/gyro" in chosen["IMU topic"].text
+
+
 def test_the_hash_of_a_file_is_its_sha256_and_that_of_a_folder_covers_all_its_files(tmp_path: Path) -> None:
     folder = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4))
     file = next(folder.glob("*.mcap"))
