@@ -24,7 +24,7 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.pause import PAUSE_S
 from app.slam.sections import ImuParams
-from app.slam.types import F64, I64, DroppedScan, Scan
+from app.slam.types import F64, I64, DroppedScan, Scan, Vector
 
 MOST_IN_BATCH = 50
 """Samples that are read at a time."""
@@ -106,11 +106,15 @@ class _Census:
     returns: int = 0
     copies: int = 0
     last: Scan | None = None
+    last_sample: tuple[int, Vector, Vector] | None = None
     reasons: Counter[str] = field(default_factory=Counter)
 
     def add(self, entry: ScanEntry | ImuEntry | OtherEntry) -> None:
         if isinstance(entry, ImuEntry):
-            self.imu_times.append((entry.log_ns, entry.stamp_ns))
+            sample = (entry.stamp_ns, entry.gyro, entry.accel)
+            if sample != self.last_sample:  # one that came twice says nothing of the rate
+                self.imu_times.append((entry.log_ns, entry.stamp_ns))
+            self.last_sample = sample
             self.sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
         elif isinstance(entry, ScanEntry):
             if isinstance(entry.scan, Scan):

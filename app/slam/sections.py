@@ -61,9 +61,9 @@ class RecordingParams(Section):
     """How a recording is read. `auto` lets the doctor decide and report its choice."""
 
     lidar_topic: str = _on_restart(
-        "", "Topic of the point clouds. Empty: the PointCloud2 topic with the most messages."
+        "", "Topic of the point clouds. Empty: that with times and rings, or else with the most messages."
     )
-    imu_topic: str = _on_restart("", "Topic of the IMU. Empty: the Imu topic with the most messages.")
+    imu_topic: str = _on_restart("", "Topic of the IMU. Empty: the whole IMU with the most messages.")
     time_field: str = _on_restart("auto", "Name of the per-point time field. `none` derives the time from the azimuth.")
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = _on_restart("auto", "Unit of the per-point time.")
     time_reference: Literal["auto", "absolute", "relative"] = _on_restart(

@@ -80,6 +80,17 @@ def test_a_pause_of_the_recorder_is_told_once_and_is_no_fault_of_the_imu(tmp_pat
     assert "at 1.0 s" in found["pauses"].text and found["IMU gaps"].verdict == "fine"
 
 
+def test_samples_that_came_twice_are_no_batches(tmp_path: Path) -> None:
+    entries = [
+        (topic, log + late, sent)
+        for topic, log, sent in rig.walk(turns=20, columns=4, imu_period_ns=5_000_000)
+        for late in ((0, 100_000) if topic == "/imu" else (0,))
+    ]
+    found = by_subject(rig.write(tmp_path / "walk", entries))
+    assert found["IMU rate"].verdict == "fine" and "200.00 Hz" in found["IMU rate"].text
+    assert found["IMU time"].verdict == "corrected" and "repeated stamps" in found["IMU time"].text
+
+
 def test_scans_that_came_twice_are_no_second_lidar(tmp_path: Path) -> None:
     entries = [
         (topic, log + late, sent)
