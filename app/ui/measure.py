@@ -11,13 +11,14 @@ from app.georeference.reference import GeoReference
 from app.mapping.kept import Measure, Spot
 from app.server.keeping import DropMeasure, KeepMeasure, RenameMeasure
 from app.server.protocol import Snapshot
+from app.slam.errors import HemislamError
 from app.slam.types import F64
 from app.ui.corners import snapped
 from app.ui.html import panel
 from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, words
 from app.ui.nodes import add_exact_points, add_lines, clear, segments
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, dialog
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, ask_text, by_user, show
 
 POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick"
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
@@ -114,7 +115,8 @@ class MeasurePanel:
             numbered = (f"{kind} {number}" for number in itertools.count(1))
             name = self._name.value.strip() or next(name for name in numbered if name not in taken)
             self._page.send(KeepMeasure(Measure(name, self._spots)))
-            self._spots, self._name.value = (), ""  # type: ignore[misc]  # mypy overlooks viser's setter
+            self._spots = ()
+            show(self._name, "")
 
     def _draw_scene(self, begun: F64 | None) -> None:
         clear(self._nodes)
@@ -164,16 +166,12 @@ class MeasurePanel:
                 self._ask_name(measure, client)
 
     def _ask_name(self, measure: Measure, client: viser.ClientHandle) -> None:
-        with dialog(client, "Rename measure") as close:
-            name = client.gui.add_text("name", measure.name)
-            keep = client.gui.add_button("Rename", icon=viser.Icon.CHECK)
+        def rename(name: str) -> None:
+            if not name.strip():
+                raise HemislamError("The name is empty; write one, or cancel.")
+            self._page.send(RenameMeasure(measure, name.strip()))
 
-        def renamed(_: object) -> None:
-            if name.value.strip():
-                self._page.send(RenameMeasure(measure, name.value.strip()))
-                close()
-
-        keep.on_click(renamed)
+        ask_text(client, "Rename measure", "name", measure.name, "Rename", rename)
 
     def _download(self, client: viser.ClientHandle) -> None:
         recording = self._page.snapshot().recording

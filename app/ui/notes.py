@@ -13,7 +13,7 @@ from app.slam.types import F64
 from app.ui.html import panel
 from app.ui.nodes import add_exact_points, clear
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, dialog
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, ask_text, show
 
 _SHOWN_NOTES: Final = 30
 _PINNED: Final = 100
@@ -51,7 +51,7 @@ class NotesPanel:
             if self._page.snapshot().recording is None:
                 raise HemislamError("No recording is open that the note could be kept with; open one first.")
             self._page.send(AddNote(self._text.value))
-            self._text.value = ""  # type: ignore[misc]  # mypy overlooks viser's setter
+            show(self._text, "")
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
         """What the list sends: "go 812", "edit 3", "delete 3"."""
@@ -65,17 +65,12 @@ class NotesPanel:
             self._ask(number, notes[number].text, client)
 
     def _ask(self, place: int, before: str, client: viser.ClientHandle) -> None:
-        with dialog(client, "Edit note") as close:
-            text = client.gui.add_text("note", before)
-            keep = client.gui.add_button("Keep", icon=viser.Icon.CHECK)
-
-        def kept(_: object, __: viser.ClientHandle) -> None:
-            if not text.value.strip():
+        def keep(text: str) -> None:
+            if not text.strip():
                 raise HemislamError("The note is empty; write something, or cancel and delete it by ✕ in the list.")
-            self._page.send(EditNote(place, before, text.value))
-            close()
+            self._page.send(EditNote(place, before, text))
 
-        keep.on_click(by_user(kept))
+        ask_text(client, "Edit note", "note", before, "Keep", keep)
 
     # --- pins ------------------------------------------------------------------------------------
     def _draw_pins(self, snapshot: Snapshot, view: View) -> None:

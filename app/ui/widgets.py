@@ -151,9 +151,11 @@ def _same(before: object, now: object) -> bool:
 
 
 def show(control: Any, value: Any) -> None:
-    """Make a control show `value`. Its callbacks then run with `client=None`; `by_user` ignores those."""
-    if control.value != value:
-        control.value = value
+    """Make a control show `value`. Where that is new, its callbacks run with `client=None`; `by_user` ignores those.
+
+    mypy overlooks viser's setter.
+    """
+    control.value = value
 
 
 def limited(box: _NumberBox) -> _NumberBox:
@@ -162,10 +164,9 @@ def limited(box: _NumberBox) -> _NumberBox:
     viser applies them to its arrows alone. Its event loop waits for this callback and only then calls later ones.
     """
     low, high = (-np.inf if box.min is None else box.min), (np.inf if box.max is None else box.max)
-    control: Any = box  # mypy overlooks viser's setter
 
     async def keep_within(_: object) -> None:
-        control.value = np.clip(control.value, low, high)
+        show(box, np.clip(box.value, low, high))
 
     box.on_update(keep_within)
     return box
@@ -184,6 +185,25 @@ def dialog(client: viser.ClientHandle, title: str) -> Iterator[Callable[[], None
         yield modal.close
         cancel = client.gui.add_button("Cancel", color="gray")
     cancel.on_click(lambda _: modal.close())
+
+
+def ask_text(
+    client: viser.ClientHandle, title: str, label: str, text: str, confirm: str, act: Callable[[str], None]
+) -> None:
+    """A dialog in one browser with a text to edit. A HemislamError of `act` is shown, and the dialog stays.
+
+    Args:
+        label: of the field. text: in it at first. confirm: on the button that calls `act` with what it holds then.
+    """
+    with dialog(client, title) as close:
+        field = client.gui.add_text(label, text)
+        button = client.gui.add_button(confirm, icon=viser.Icon.CHECK)
+
+    def confirmed(_: object, __: viser.ClientHandle) -> None:
+        act(field.value)
+        close()
+
+    button.on_click(by_user(confirmed))
 
 
 def notify_error(client: viser.ClientHandle, error: object) -> None:

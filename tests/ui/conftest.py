@@ -161,6 +161,25 @@ def user_clicks(handle: Any) -> None:
     user_sets(handle, True)
 
 
+class Browser:
+    """A browser that shows a dialog. told: its notifications. added: the dialog's controls by their labels."""
+
+    def __init__(self, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.gui, self.told, self.added = server.gui, list[str](), dict[str, Any]()
+        for kind in ("add_text", "add_button"):
+            monkeypatch.setattr(server.gui, kind, self._noting(getattr(server.gui, kind)))
+
+    def _noting(self, add: Any) -> Any:
+        return lambda label, *args, **options: self.added.setdefault(label, add(label, *args, **options))
+
+    def add_notification(self, _title: str, text: str, **_: Any) -> None:
+        self.told.append(text)
+
+    def clicks(self, button: str) -> None:
+        for callback in self.added[button]._impl.update_cb:
+            callback(viser.GuiEvent(client=self, client_id=0, target=self.added[button]))  # type: ignore[arg-type]
+
+
 class BusyThreads:
     """Runs what it is given when told to, as threads do that are late."""
 

@@ -9,14 +9,14 @@ import pytest
 import viser
 
 from app.mapping.kept import Measure, Spot
-from app.server.keeping import DropMeasure, KeepMeasure
+from app.server.keeping import DropMeasure, KeepMeasure, RenameMeasure
 from app.server.protocol import Chunk, Command, Snapshot
 from app.slam import lie
 from app.slam.types import NON_GROUND
 from app.ui.measure import ANGLE, DISTANCE, POINT, STOP, MeasurePanel
 from app.ui.measure_maths import as_csv, height, meet, numbers, places, words
 from app.ui.widgets import View
-from tests.ui.conftest import Wire, page_of, user_sets
+from tests.ui.conftest import Browser, Wire, page_of, user_sets
 
 RANDOM = np.random.default_rng(7)
 SEEN_AT = lie.transform(lie.exp(np.array([0.1, -0.2, 1.0])), np.array([4.0, -1.0, 1.2]))
@@ -238,3 +238,20 @@ def test_the_list_deletes_a_measure_and_an_empty_list_is_not_there(server: viser
     bench.now = replace(bench.now, measures=())
     bench.panel.draw(bench.now, View())
     assert not bench.panel._list.visible and not bench.panel._save.visible
+
+
+def test_a_measure_without_a_name_is_refused_in_words(
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(server)
+    bench.panel.begin(POINT)
+    bench.click(0.0, 0.0)
+    bench.keep()
+    browser = Browser(server, monkeypatch)
+    bench.panel._act("rename 0 point 1", browser)  # type: ignore[arg-type]
+    user_sets(browser.added["name"], " ")
+    browser.clicks("Rename")
+    assert bench.sent == [] and "The name is empty" in browser.told[0]
+    user_sets(browser.added["name"], "door ")
+    browser.clicks("Rename")
+    assert bench.sent == [RenameMeasure(bench.now.measures[0], "door")] and len(browser.told) == 1

@@ -15,7 +15,7 @@ from app.server.protocol import Command, OpenedRecording, Seek, Snapshot
 from app.slam.errors import HemislamError
 from app.ui.notes import _SHOWN_NOTES, NotesPanel
 from app.ui.widgets import View
-from tests.ui.conftest import BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
+from tests.ui.conftest import Browser, BusyThreads, Wire, browser_sends, page_of, user_clicks, user_sets
 
 
 class Notes:
@@ -108,25 +108,6 @@ def test_nothing_is_sent_to_the_page_while_no_note_is_added(notes: Notes, wire: 
     assert wire.messages == []
     notes.show(Note(3, "here"), Note(4, "and there"))
     assert wire.messages
-
-
-class Browser:
-    """A browser that shows a dialog. told: its notifications. added: the dialog's controls by their labels."""
-
-    def __init__(self, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.gui, self.told, self.added = server.gui, list[str](), dict[str, Any]()
-        for kind in ("add_text", "add_button"):
-            monkeypatch.setattr(server.gui, kind, self._noting(getattr(server.gui, kind)))
-
-    def _noting(self, add: Any) -> Any:
-        return lambda label, *args, **options: self.added.setdefault(label, add(label, *args, **options))
-
-    def add_notification(self, _title: str, text: str, **_: Any) -> None:
-        self.told.append(text)
-
-    def clicks(self, button: str) -> None:
-        for callback in self.added[button]._impl.update_cb:
-            callback(viser.GuiEvent(client=self, client_id=0, target=self.added[button]))  # type: ignore[arg-type]
 
 
 def test_an_emptied_note_is_not_deleted_without_a_word(
