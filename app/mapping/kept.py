@@ -1,7 +1,7 @@
 """What the user makes beside the map and a session keeps: notes, views, measures, marks of the brush, the clip box."""
 
 from dataclasses import dataclass, fields
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import PlainSerializer, PlainValidator
 
@@ -88,10 +88,9 @@ class Kept:
     painted: tuple[_Stroke, ...] = ()
     clip: Clip = WHOLE
 
-    @classmethod
-    def of(cls, whole: "Kept") -> "Kept":
-        """This part of a value that holds more."""
-        return Kept(**{field.name: getattr(whole, field.name) for field in fields(Kept)})
+    def kept(self) -> dict[str, Any]:
+        """All of it by name, of a value that may hold more."""
+        return {field.name: getattr(self, field.name) for field in fields(Kept)}
 
 
 NOTHING_KEPT = Kept()

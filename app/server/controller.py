@@ -6,7 +6,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -192,9 +191,8 @@ class Controller:
             self._page.put(progress=shown, urgent=True)
 
     def _keep(self, kept: Kept) -> None:
-        before, self._kept = self._kept, kept
-        names = (field.name for field in fields(Kept))
-        others = {name: value for name in names if (value := getattr(kept, name)) is not getattr(before, name)}
+        before, self._kept = self._kept.kept(), kept
+        others = {name: value for name, value in kept.kept().items() if value is not before[name]}
         self._page.put(**others, urgent=bool(others))
 
     def _show_params(self) -> None:
@@ -266,7 +264,7 @@ class Controller:
             speed=self._page.transport.speed,
             labels=session.keyframes.edits,
             calibration=session.calibration,
-            **{field.name: getattr(self._kept, field.name) for field in fields(Kept)},
+            **self._kept.kept(),
         )
 
     # --- opening ---------------------------------------------------------------------------------
@@ -344,7 +342,7 @@ class Controller:
         self._page.put(resumed=saved is not None)
         if session.frame < 0:  # else it goes on where a process that died was
             state = saved.state if saved is not None else State(self._params)
-            self._keep(Kept.of(state))
+            self._keep(Kept(**state.kept()))
         self._resuming = None
         if saved is not None:
             # This process may die on the way there.

@@ -41,6 +41,10 @@ class Folders:
             if not root.is_dir():
                 raise HemislamError(f"{root} is not a folder; give a folder that holds recordings.")
 
+    def and_also(self, folder: Path) -> "Folders":
+        """These folders and one more, if it exists."""
+        return Folders((*self.roots, folder)) if folder.is_dir() else self
+
     def inside(self, path: Path | str) -> Path:
         """The real path behind `path`, relative to the first folder if it is not absolute.
 

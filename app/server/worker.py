@@ -145,7 +145,7 @@ class EngineProcess:
             breakpoints=last.breakpoints,
             session=last.session,
             notices=last.last_notice,
-            kept=Kept.of(last),
+            kept=Kept(**last.kept()),
         )
 
     def _edit(self, **values: Any) -> None:

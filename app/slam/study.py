@@ -126,7 +126,7 @@ _UNITS = (
 def ply(result: StepResult) -> bytes:
     """A frame as a binary PLY file, in the LiDAR frame; a comment holds its pose in the map."""
     table = vertices(result)
-    pose = " ".join(f"{value:.9g}" for value in (result.T_map_imu @ result.state.T_imu_lidar)[:3].ravel())
+    pose = " ".join(f"{value:.9g}" for value in result.T_map_lidar[:3].ravel())
     comments = (f"hemislam frame {result.index}, {result.stamp_ns} ns", _UNITS, f"T_map_lidar, rows: {pose}")
     return header(VERTEX, len(table), *comments) + table.tobytes()
 
@@ -134,7 +134,7 @@ def ply(result: StepResult) -> bytes:
 def pcd(result: StepResult) -> bytes:
     """The same as a binary PCD file; its viewpoint is the pose of the LiDAR in the map."""
     table = vertices(result)
-    T = result.T_map_imu @ result.state.T_imu_lidar
+    T = result.T_map_lidar
     x, y, z, w = quaternion(T[:3, :3])
     viewpoint = " ".join(f"{value:.9g}" for value in (*T[:3, 3], w, x, y, z))
     comment = f"hemislam frame {result.index}, {result.stamp_ns} ns; {_UNITS}"

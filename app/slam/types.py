@@ -361,3 +361,7 @@ class StepResult:
     @property
     def T_map_imu(self) -> F64:
         return self.T_map_odom @ self.state.T_odom_imu
+
+    @property
+    def T_map_lidar(self) -> F64:
+        return self.T_map_imu @ self.state.T_imu_lidar

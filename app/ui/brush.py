@@ -16,7 +16,7 @@ from app.ui.colours import LABEL_COLOURS
 from app.ui.html import panel
 from app.ui.nodes import add_points, clear, place
 from app.ui.sensor import SCAN_POINT_SCALE
-from app.ui.study_maths import nearest_to_ray
+from app.ui.study_maths import point_at
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user
 
@@ -93,7 +93,7 @@ class BrushPanel:
         shown = np.flatnonzero(found != UNMARKED)
         points, colours = result.cloud.points[shown], _COLOURS[found[shown]]
         node = add_points(self._page.scene, f"{ROOT}/painted", points, colours, _SCALE * SCAN_POINT_SCALE * size)
-        place(node, result.T_map_imu @ result.state.T_imu_lidar)
+        place(node, result.T_map_lidar)
         self._nodes.append(node)
 
     # --- what is marked --------------------------------------------------------------------------
@@ -106,18 +106,14 @@ class BrushPanel:
         """Take a click in the scene, while the brush is on; whether it was taken."""
         if (result := self._frame()) is None:
             return self.painting
-        ray = self._page.in_map(event)
-        T = lie.inverse(result.T_map_imu @ result.state.T_imu_lidar)
-        points = result.cloud.points
-        index = nearest_to_ray(points, lie.moved(T, ray[0]), T[:3, :3] @ ray[1])
+        points, index = result.cloud.points, point_at(result, self._page.in_map(event))
         if index is not None:
             self._paint(result, np.linalg.norm(points - points[index], axis=1) <= self._radius.value)
         return True
 
     def _drag(self, event: viser.SceneRectSelectEvent) -> None:
         if (result := self._frame()) is not None:
-            T = result.T_map_imu @ result.state.T_imu_lidar
-            seen = self._page.in_picture(event.client, lie.moved(T, result.cloud.points))
+            seen = self._page.in_picture(event.client, lie.moved(result.T_map_lidar, result.cloud.points))
             low, high = np.array(event.screen_min), np.array(event.screen_max)
             self._paint(result, np.asarray(((seen >= low) & (seen <= high)).all(axis=1)))
 

@@ -20,7 +20,7 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.ui.background import Background
 from app.ui.html import panel
-from app.ui.widgets import Page, add_button
+from app.ui.widgets import Page, add_button, show
 
 _EXPLAINED = (
     "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and what each scan line gets "
@@ -97,7 +97,7 @@ class CalibrationPanel:
 
     def _show(self, message: Any) -> None:
         if isinstance(message, float):
-            self._progress.value = 100 * message  # type: ignore[misc]  # mypy overlooks viser's setter
+            show(self._progress, 100 * message)
             return
         self.close()
         found = message if isinstance(message, FoundMounting) else FoundMounting([("", message)], {})
@@ -143,7 +143,7 @@ class CalibrationPanel:
         recording, params = snapshot.recording.path, snapshot.params
         self._asked, self._tried, self._given = asked, True, params
         self._notified.clear()
-        self._progress.value = 0.0  # type: ignore[misc]  # as above
+        show(self._progress, 0.0)
         self._progress.visible, self._apply.visible, self._keep.visible = True, False, False
         try:
             self._work.begin(find, recording, self._uncalibrated(recording, params))

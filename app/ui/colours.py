@@ -258,7 +258,7 @@ def legend(by: str, limits: Limits | None, ends: Limits | None = None) -> str:
         return names
     if limits is None or by == KEYFRAME:
         why = panel("note", "Choose the map to compare with under View, Distance to another map.")
-        return panel("colour_bar", stops, "", found.what, "") + names + why * (by == DISTANCE)
+        return panel("macros.bar", stops, "", found.what, "") + names + why * (by == DISTANCE)
     shown = ends or limits
     shares = [round(100 * (end - limits.low) / (limits.high - limits.low)) for end in (shown.low, shown.high)]
     low, high = (min(max(share, 0), 100) for share in shares)

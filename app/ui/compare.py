@@ -103,7 +103,7 @@ class CompareScene:
         self._lidar.visible = result is not None
         if result is None:
             return
-        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
+        place(self._lidar, result.T_map_lidar)
         shown = shown_of(len(result.cloud))
         self._cloud.points = result.cloud.points[shown].astype(np.float16)
         self._cloud.colors = maths.GROUND_COLOURS[ground[shown]]

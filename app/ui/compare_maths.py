@@ -13,6 +13,7 @@ from app.slam.types import F64, I64, NON_GROUND, U8, Cloud
 from app.ui.colours import LABEL_COLOURS, Rgb
 from app.ui.html import BAD, WARN, Tile, number, panel
 from app.ui.nodes import PATH_COLOUR
+from app.ui.transport import working
 
 A_COLOUR: Final[Rgb] = PATH_COLOUR
 B_COLOUR: Final[Rgb] = (77, 163, 255)
@@ -136,8 +137,7 @@ def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
     if not b.engine_alive:
         return "B's engine has stopped; A is not affected. Keep what B has, or discard it.", BAD
     if b.progress is not None:
-        share = b.progress.fraction
-        return b.progress.title + (f" · {100 * share:.0f} %" if np.isfinite(share) else " …"), WARN
+        return working(b.progress), WARN
     if b.recording is None:
         return "B is starting …", WARN
     if not same_recording(a, b):

@@ -185,7 +185,7 @@ class FilesPanel:
             )
 
     def _browse_trajectories(self, client: viser.ClientHandle) -> None:
-        folders = Folders([*self._folders.roots, *([self._results] if self._results.is_dir() else [])])
+        folders = self._folders.and_also(self._results)
         recording, gui = self._page.snapshot().recording, client.gui
 
         def stop(_: object) -> None:

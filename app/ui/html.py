@@ -34,7 +34,7 @@ _TEMPLATES.globals |= {"ONE_PIXEL": ONE_PIXEL, "HINTS": HINTS}
 
 
 def panel(name: str, *args: Any) -> str:
-    """The HTML of a macro: "note" of `panels.html`, "loops.table" of `loops.html`."""
+    """The HTML of a macro: "note" of `panels.html`, "loops.table" of `loops.html`, "macros.tiles" of `macros.html`."""
     template, _, macro = name.rpartition(".")
     return str(getattr(_TEMPLATES.get_template(f"{template or 'panels'}.html").module, macro)(*args))
 
@@ -54,7 +54,7 @@ def css(rgb: tuple[int, int, int]) -> str:
 
 
 def heading(text: str) -> str:
-    return panel("title_only", text)
+    return panel("macros.heading", text)
 
 
 def number(value: float, digits: int = 2) -> str:

@@ -18,7 +18,7 @@ from app.ui.colours import DENSITY, DISTANCE, LOOK, MODES, TABLES, Limits, value
 from app.ui.files import FileList
 from app.ui.html import Tile, number, panel
 from app.ui.map_numbers import Density, MapNumbers
-from app.ui.widgets import Changes, Page, View, add_button, dialog, limited
+from app.ui.widgets import Changes, Page, View, add_button, dialog, limited, show
 
 _BINS: Final = 41
 _LEAST_M: Final = 0.005
@@ -82,7 +82,7 @@ class MapComparePanel:
         self._progress.visible = self._stop.visible = running
         old = self._distance is not None and current.chunks is not self._chunks
         if self._changes(self._comparison, old, int(100 * self._share)):
-            self._progress.value = 100 * self._share  # type: ignore[misc]  # mypy overlooks viser's setter
+            show(self._progress, 100 * self._share)
             self._found.visible = self._comparison is not None
             if self._comparison is not None:
                 self._found.content = summary(self._comparison, self._name, [_OLD] if old else [])
@@ -99,7 +99,7 @@ class MapComparePanel:
             self._colour_by(self._before)
 
     def _browse(self, client: viser.ClientHandle) -> None:
-        folders = Folders([*self._folders.roots, *([self._results] if self._results.is_dir() else [])])
+        folders = self._folders.and_also(self._results)
         with dialog(client, "Compare with a map") as close:
             nothing = "No maps (.ply, .las, .laz) here. “Save results…” writes one."
             FileList(client.gui, folders, CLOUDS, nothing, lambda path: self._begin(folders.inside(path)), close)

@@ -20,7 +20,7 @@ from app.ui.colours import Key
 from app.ui.files import result_folder_name, size_text
 from app.ui.html import panel
 from app.ui.picture_maths import Station, composed, flight
-from app.ui.widgets import Changes, Page, add_button, limited, notify_error
+from app.ui.widgets import Changes, Page, add_button, limited, notify_error, show
 
 _LARGEST: Final = 8192
 _MOST_PIXELS: Final = 6144 * 4096
@@ -69,7 +69,7 @@ class PicturesPanel:
         self._start.disabled = flying or len(snapshot.trajectory) < 2
         if self._changes(flying, int(100 * self._share), str(self._saved)):
             self._progress.visible = self._stop.visible = flying
-            self._progress.value = 100 * self._share  # type: ignore[misc]  # mypy overlooks viser's setter
+            show(self._progress, 100 * self._share)
             done = not flying and self._saved.is_file()
             self._where.visible = self._download.visible = done
             if done:

@@ -72,7 +72,7 @@ class SensorScene:
             start_ns: of the recording.
         """
         self._imu.visible = True
-        T_map_lidar = result.T_map_imu @ result.state.T_imu_lidar
+        T_map_lidar = result.T_map_lidar
         cloud, shown = result.cloud, np.arange(len(result.cloud))[shown_of(len(result.cloud))]
         if view.clip is not None:
             shown = shown[view.clip.holds(lie.moved(T_map_lidar, cloud.points[shown]))]

@@ -24,8 +24,8 @@ from app.ui.study_maths import (
     Picked,
     curve,
     describe,
-    nearest_to_ray,
     pick,
+    point_at,
     study_colours,
     study_legend,
 )
@@ -67,7 +67,7 @@ class StudyScene:
         if result is None or len(points) == 0:
             clear(self._cloud)
             return
-        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
+        place(self._lidar, result.T_map_lidar)
         shown = shown_of(len(points))
         colours = study_colours(result, by)[shown]
         size *= 2.2 if by == RESIDUAL else SCAN_POINT_SCALE
@@ -78,7 +78,7 @@ class StudyScene:
         clear(self._marks)
         if result is None or picked is None:
             return
-        place(self._lidar, result.T_map_imu @ result.state.T_imu_lidar)
+        place(self._lidar, result.T_map_lidar)
         points, patch = result.cloud.points, picked.patch
         for name, chosen, colour, scale in (
             ("neighbours", patch.indices[1:], _NEIGHBOURS, 2.0),
@@ -158,9 +158,7 @@ class StudyPanel:
         if result is None or before is None or result.cloud.points is not before.cloud.points:
             index = None  # that point was of another frame
         if clicked is not None and result is not None and not snapshot.transport.playing:
-            T = result.T_map_imu @ result.state.T_imu_lidar
-            origin, direction = T[:3, :3].T @ (clicked[0] - T[:3, 3]), T[:3, :3].T @ clicked[1]
-            index = nearest_to_ray(result.cloud.points, origin, direction)
+            index = point_at(result, clicked)
         if not self._point_changes(result if index is not None else None, index, sigma, count, view.point_size):
             return
         if result is None or index is None:

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from app.slam import lie
 from app.slam.study import MATCH_M, Patch, nearest_match, neighbourhood, point_numbers
 from app.slam.types import F32, F64, U8, StepResult
 from app.ui.colours import LABEL_NAMES, TABLES, Limits, value_colours
@@ -89,7 +90,7 @@ def study_legend(result: StepResult | None, by: str) -> str:
     mode = STUDY_MODES[by]
     limits = mode.limits(result)
     high = f"{limits.high:g}{'+' if mode.open_end else ''}"
-    return panel("colour_bar", TABLES[mode.table][::32], f"{limits.low:g}", f"{by} · {mode.legend}", high)
+    return panel("macros.bar", TABLES[mode.table][::32], f"{limits.low:g}", f"{by} · {mode.legend}", high)
 
 
 # --- the ground threshold ------------------------------------------------------------------------
@@ -164,6 +165,12 @@ def nearest_to_ray(points: F32, origin: F64, direction: F64) -> int | None:
     return best if off[best] < _REACH else None
 
 
+def point_at(result: StepResult, ray: tuple[F64, F64]) -> int | None:
+    """The same of a frame's points. ray: origin and direction, (3,) each, in the map."""
+    T = lie.inverse(result.T_map_lidar)
+    return nearest_to_ray(result.cloud.points, lie.moved(T, ray[0]), T[:3, :3] @ ray[1])
+
+
 @dataclass(frozen=True, slots=True)
 class Picked:
     """A point under study. Lengths m, angles rad; `patch` in the LiDAR frame.
@@ -229,7 +236,7 @@ def describe(result: StepResult, picked: Picked) -> str:
         ),
         _match_tile(result, picked),
     ]
-    return panel("tile_grid", tiles)
+    return panel("macros.tiles", tiles)
 
 
 def _match_tile(result: StepResult, picked: Picked) -> Tile:

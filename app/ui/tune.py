@@ -17,7 +17,7 @@ from app.ui.background import Background
 from app.ui.compare import Sides
 from app.ui.html import panel
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_button
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_button, show
 
 _PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
 _LABELLED: Final = "the labelled frames"
@@ -92,7 +92,7 @@ class TunePanel:
             self._plots.content, self._plots.visible = self._bridge.live(html), bool(html)
             if self._wanted is not None:
                 share = 100 * done / (self._wanted.trials + 1)
-                self._progress.value = min(share, 100.0)  # type: ignore[misc]  # mypy overlooks viser's setter
+                show(self._progress, min(share, 100.0))
 
     def close(self) -> None:
         """End what is under way; its finished runs stay."""

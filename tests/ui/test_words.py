@@ -47,7 +47,7 @@ def test_findings_that_need_the_user_come_first_with_their_option() -> None:
     [
         lambda text: findings_html((replace(FINDINGS[0], subject=text, text=text, option=text),), Params()),
         lambda text: log_html((Notice(1, "error", text),)),
-        lambda text: panel("tile_grid", [Tile(text, text, text, text)]),
+        lambda text: panel("macros.tiles", [Tile(text, text, text, text)]),
         lambda text: title(Snapshot(recording=replace(FakeEngine(frames=2).snapshot.recording, path=Path(text)))),  # type: ignore[type-var]
     ],
 )

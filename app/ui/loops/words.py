@@ -125,7 +125,7 @@ def evidence(edge: LoopEdge, params: LoopsParams) -> str:
         Tile("difference", number(e.context_distance), "", f"≤ {params.context_distance:g}",
              _judged(e.context_distance, params.context_distance)),
     ]  # fmt: skip
-    return panel("tile_grid", tiles)
+    return panel("macros.tiles", tiles)
 
 
 def largest_factors(residuals: tuple[FactorResidual, ...]) -> str:
