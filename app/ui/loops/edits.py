@@ -15,7 +15,7 @@ from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.words import BRIDGE, describe_edit, forecast, kind_of, what_happened, what_was_undone
 from app.ui.nodes import add_lines, clear, segments
-from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, by_user, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, as_set, by_user, show
 
 _REST_S: Final = 0.3
 _GHOST: Final[dict[bool, Rgb]] = {False: (255, 232, 70), True: (120, 90, 0)}
@@ -205,7 +205,7 @@ class VerdictPanel:
         self._weight = gui.add_slider(
             "weight", 0.1, 10.0, 0.1, 1.0, hint="Divides its covariance in the graph; 1 is as registered."
         )
-        self._weight.on_update(by_user(lambda weight, _: self._drag(weight)))
+        self._weight.on_update(as_set(lambda weight, _: self._drag(weight)))
 
     def draw(self, edge: LoopEdge | None, weighing: float | None, words: str, undo: bool) -> None:
         """Show the loop's verdict.

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import viser
 
 from app.server.protocol import EditLoop, RedoLoop, TryLoop, UndoLoop
 from app.slam.errors import HemislamError
@@ -12,7 +13,7 @@ from app.slam.loops import edit_files
 from app.slam.loops.edits import Accept, Add, Reject, SetWeight
 from app.slam.loops.types import Verdict
 from app.ui.loops.edits import enlarged
-from tests.ui.conftest import user_clicks, user_sets
+from tests.ui.conftest import BusyThreads, browser_sends, user_clicks, user_sets
 from tests.ui.loops.conftest import GOOD, OLDER, WAITING, Page, rejected
 
 
@@ -141,6 +142,18 @@ def test_the_weight_is_tried_when_the_hand_rests(page: Page) -> None:
     user_clicks(page.loops._proposal._apply)
     page.draw()
     assert page.edge(GOOD).weight == 4.0 and page.loops._verdict._weight.value == 4.0
+
+
+def test_a_weight_set_just_before_the_page_draws_is_tried(
+    server: viser.ViserServer, page: Page, busy: BusyThreads
+) -> None:
+    page.choose(GOOD)
+    page.engine.sent.clear()
+    browser_sends(server, page.loops._verdict._weight, 4.0)
+    page.draw()
+    busy.catch_up()
+    page.draw()
+    assert TryLoop(SetWeight(*GOOD, 4.0)) in page.engine.sent
 
 
 def test_choosing_another_loop_drops_what_was_being_considered(page: Page) -> None:
