@@ -1,9 +1,9 @@
 """Commands that change what a session keeps beside the map, and what each of them makes of it."""
 
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
-from app.mapping.kept import Clip, Kept, KeptView, Measure, Note
+from app.mapping.kept import Kept, KeptView, Measure, Note
 from app.mapping.painted import Stroke
 from app.server.protocol import Command
 from app.slam.errors import HemislamError
@@ -56,9 +56,9 @@ class RenameMeasure(KeptCommand, frozen=True):
 
 
 class SetClip(KeptCommand, frozen=True):
-    """Show only a part of the map, or all of it."""
+    """Show only a part of the map, or all of it. changes: new values of fields of `Clip`; the others stay."""
 
-    clip: Clip
+    changes: dict[str, Any]
 
 
 class DropMeasure(KeptCommand, frozen=True):
@@ -78,7 +78,7 @@ class UndoPaint(KeptCommand, frozen=True):
 
 
 def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
-    """The same after a command, given at a frame. Raises HemislamError: there are too many notes."""
+    """The same after a command, given at a frame. Raises HemislamError: there are too many notes, or as `Clip`."""
     notes, measures = kept.notes, kept.measures
     match command:
         case AddNote(text) if text.strip():
@@ -97,8 +97,8 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
             return replace(kept, measures=tuple(renamed if one == measure else one for one in measures))
         case DropMeasure(measure):
             return replace(kept, measures=tuple(one for one in measures if one != measure))
-        case SetClip(clip):
-            return replace(kept, clip=clip)
+        case SetClip(changes):
+            return replace(kept, clip=replace(kept.clip, **changes))
         case Paint(stroke):
             return replace(kept, painted=(*kept.painted, stroke))
         case UndoPaint():

@@ -21,7 +21,7 @@ from app.ui.geometry import wxyz
 from app.ui.html import panel
 from app.ui.measure import MeasurePanel
 from app.ui.nodes import add_lines
-from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user, limited, notify_error, show
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, as_set, by_user, limited, notify_error, show
 
 _NODE: Final = f"{ROOT}/clip"
 _COLOUR: Final = (255, 205, 80)
@@ -85,9 +85,9 @@ class ClipPanel:
             gui, "Save the profile…", lambda client: ask_where(client, "profile"), save, visible=False
         )
         for control in (self._middle, self._size, self._turn):
-            control.on_update(by_user(lambda _, __: self._typed()))
+            control.on_update(as_set(lambda _, __: self._typed()))
         self._on.on_update(by_user(lambda on, _: self._switch(on)))
-        self._slab.on_update(by_user(lambda slab, _: self._send(slab=slab)))
+        self._slab.on_update(as_set(lambda slab, _: self._send(slab=slab)))
         self._unrolled.on_update(by_user(self._unroll))
 
     def seen(self, current: Snapshot, view: View) -> View:
@@ -114,15 +114,15 @@ class ClipPanel:
 
     # --- what is chosen --------------------------------------------------------------------------
     def _send(self, **changes: Any) -> None:
-        self._page.send(SetClip(replace(self._page.snapshot().clip, **changes)))
+        self._page.send(SetClip(changes))
 
     def _switch(self, on: bool) -> None:
-        box = self._page.snapshot().clip.box
         try:
-            self._send(on=on, box=box or self._whole())
+            box = {} if self._page.snapshot().clip.box is not None else {"box": self._whole()}
         except HemislamError:
             show(self._on, False)
             raise
+        self._send(on=on, **box)
 
     def _whole(self) -> Box:
         """The box around all of the map but a few far points. Raises HemislamError: there is no map yet."""
@@ -161,12 +161,13 @@ class ClipPanel:
         except HemislamError:
             show(self._unrolled, False)
             raise
-        self._send(unrolled=on, on=self._page.snapshot().clip.on and not on)  # a section's box would leave little of it
         if on:
+            self._send(unrolled=True, on=False)  # a section's box would leave little of it
             length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
             low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
             self._camera.face(client, np.array([length / 2, 0.0, (low + high) / 2]), (length, high - low))
         else:
+            self._send(unrolled=False)
             self._camera.look(OBLIQUE, client)
 
     # --- a section by two clicks -----------------------------------------------------------------

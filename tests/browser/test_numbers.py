@@ -109,4 +109,4 @@ def test_a_box_without_a_slider_takes_no_number_beyond_its_limits(bench: Bench) 
         bench.page.keyboard.press("Enter")
         expect(slab).to_have_value(taken)
         bench.eventually(lambda taken=taken: bench.engine.snapshot.clip.slab == float(taken))
-    assert {c.clip.slab for c in bench.engine.sent if isinstance(c, SetClip)} == {0.05, 100.0, 0.5}
+    assert {c.changes["slab"] for c in bench.engine.sent if isinstance(c, SetClip)} == {0.05, 100.0, 0.5}

@@ -7,7 +7,6 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from app.export.box import Box
-from app.mapping.kept import Clip
 from app.server.keeping import KeepMeasure, SetClip
 from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, SetSpeed, StepFrame
 from app.ui.clip_maths import FACES, handle
@@ -381,7 +380,7 @@ def test_a_side_of_the_clip_box_is_pulled_by_its_handle(bench: Bench) -> None:
     bench.page.get_by_label("clip box").check()
     bench.eventually(lambda: bench.engine.snapshot.clip.hiding is not None)
     before = Box.around((6.0, 0.0, 0.0), (10.0, 6.0, 4.0), 20.0)
-    bench.engine.send(SetClip(Clip(before, on=True)))
+    bench.engine.send(SetClip({"box": before, "on": True}))
     panel = bench.workbench._clip
     bench.eventually(lambda: len(panel._handles) == 7)
     bench.eventually(lambda: np.allclose(panel._handles[1].position, handle(before, *FACES[1])[1]))
@@ -405,5 +404,5 @@ def test_a_side_of_the_clip_box_is_pulled_by_its_handle(bench: Bench) -> None:
     assert after is not None and after.size[0] > before.size[0] + 0.5
     np.testing.assert_allclose([after.size[1], after.size[2], after.turn], [6.0, 4.0, 20.0], atol=1e-6)
     np.testing.assert_allclose(handle(after, *FACES[0])[1], handle(before, *FACES[0])[1], atol=1e-6)
-    bench.engine.send(SetClip(Clip()))
+    bench.engine.send(SetClip({"box": None, "on": False}))
     bench.page.get_by_role("tab", name="Parameters").click()

@@ -188,7 +188,8 @@ def walk_about(bench: Kept) -> Snapshot:
     bench.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
     bench.do(Seek(80), Seek(70), AddNote("a turn"), KeepView(VIEW))
     wrong = Measure("wrong", DOOR.spots[:1])
-    bench.do(KeepMeasure(wrong), KeepMeasure(replace(DOOR, name="")), DropMeasure(wrong), SetClip(CLIP))
+    bench.do(KeepMeasure(wrong), KeepMeasure(replace(DOOR, name="")), DropMeasure(wrong))
+    bench.do(SetClip({"box": CLIP.box, "on": True}), SetClip({"slab": CLIP.slab}))
     bench.do(RenameMeasure(replace(DOOR, name=""), DOOR.name), Calibrated(TURNED))
     return bench.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 

@@ -203,8 +203,8 @@ class FakeEngine:
                 self._transport(speed=factor)
             case SetBreakpoints(breakpoints):
                 self.publish(breakpoints=breakpoints)
-            case SetClip(clip):
-                self.publish(clip=clip)
+            case SetClip(changes):
+                self.publish(clip=replace(snapshot.clip, **changes))
             case Seek(frame):
                 self._go_back(frame)
                 while self._snapshot.transport.frame < frame:

@@ -25,7 +25,7 @@ from app.ui.measure import MeasurePanel
 from app.ui.measure_maths import meet
 from app.ui.profile import ProfileNode, unrolled
 from app.ui.widgets import View
-from tests.ui.conftest import Wire, clouds, page_of
+from tests.ui.conftest import BusyThreads, Wire, browser_sends, clouds, page_of, user_sets
 
 BOX = Box.around((4.0, -2.0, 1.0), (6.0, 2.0, 3.0), 30.0)
 RANDOM = np.random.default_rng(5)
@@ -182,7 +182,7 @@ class Bench:
 
     def send(self, command: Command) -> None:
         assert isinstance(command, SetClip)
-        self.now = replace(self.now, clip=command.clip)
+        self.now = replace(self.now, clip=replace(self.now.clip, **command.changes))
 
     def draw(self) -> None:
         self.panel.draw(self.now)
@@ -202,6 +202,44 @@ def test_switched_on_it_holds_the_map_and_shows_its_handles(server: viser.ViserS
     bench.now = replace(bench.now, clip=Clip(BOX, on=True))
     bench.draw()
     np.testing.assert_allclose(bench.panel._middle.value, BOX.middle)
+
+
+class BusyBench(Bench):
+    """Whose engine takes commands only when it is told to."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.waiting: list[Command] = []
+        super().__init__(server)
+
+    def send(self, command: Command) -> None:
+        self.waiting.append(command)
+
+    def catch_up(self) -> None:
+        for command in self.waiting:
+            super().send(command)
+        self.draw()
+
+
+def test_what_is_set_while_the_engine_is_busy_all_counts(server: viser.ViserServer) -> None:
+    bench = BusyBench(server)
+    user_sets(bench.panel._slab, 2.5)
+    user_sets(bench.panel._on, True)
+    bench.catch_up()
+    assert bench.now.clip.hiding is not None and bench.now.clip.slab == bench.panel._slab.value == 2.5
+
+
+def test_a_number_that_arrives_just_before_an_older_snapshot_is_kept(
+    server: viser.ViserServer, busy: BusyThreads
+) -> None:
+    bench = BusyBench(server)
+    bench.now = replace(bench.now, clip=Clip(BOX, on=True))
+    bench.draw()
+    browser_sends(server, bench.panel._turn, 12.5)
+    bench.now = replace(bench.now, clip=Clip(BOX, on=True, slab=3.0))  # of the slab that was set before
+    bench.draw()
+    busy.catch_up()
+    bench.catch_up()
+    assert bench.now.clip == Clip(Box.around(BOX.middle, BOX.size, 12.5), on=True, slab=3.0)
 
 
 def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.ViserServer) -> None:
