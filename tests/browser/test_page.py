@@ -319,6 +319,24 @@ def test_what_is_asked_for_in_the_same_moment_all_arrives(bench: Bench) -> None:
     assert SetSpeed(2.0) in bench.engine.sent
 
 
+def test_a_word_of_the_page_does_not_take_the_place_of_what_a_slider_was_set_to(bench: Bench) -> None:
+    """viser sends only the last of what changes within 50 ms, of all controls of a tab together."""
+    said, alpha = bench.workbench._parameters._bridge._field, bench.engine.snapshot.params.ground.alpha
+    before = said.value
+    bench.page.get_by_role("tab", name="Parameters").click()
+    bench.page.locator("[role=slider][aria-valuenow]:not(input)").nth(1).evaluate(
+        """async (thumb) => {
+          for (let n = 0; n < 3; n++) {
+            thumb.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight', bubbles: true}));
+            await new Promise((then) => setTimeout(then, 5));
+          }
+          hemislamSay({type: 'click', target: document.querySelector('.hs-released')});
+        }"""
+    )
+    bench.eventually(lambda: said.value != before)
+    bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha == alpha + 3, seconds=5.0)
+
+
 def test_a_click_on_the_map_measures_the_point_under_it(bench: Bench) -> None:
     for _ in range(14):
         bench.engine.send(StepFrame())

@@ -1,20 +1,30 @@
 // Runs once in each page. What it relies on in viser's page is listed in app/ui/viser_adapter.py.
 if (!window.hemislamSay) {
   // A click (or Enter) on an element with data-hs: write its word into the hidden field, whose changes viser sends.
-  // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, so
-  // words wait for each other; of two that ask for the same thing the later one counts.
-  let said = 0, sending = 0;
+  // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, of
+  // all controls together. So a word waits until nothing has changed for as long, not even by the word before; of two
+  // words that ask for the same thing the later one counts.
+  const QUIET_MS = 60;
+  let said = 0, sending = 0, changed = -QUIET_MS;
   const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set, waiting = new Map();
+  for (const kind of ['input', 'click', 'keydown', 'pointermove']) {
+    document.addEventListener(kind, (event) => {
+      if (event.target.closest?.('canvas,[data-hs-to]') || (kind === 'pointermove' && !event.buttons)) return;
+      if (kind !== 'keydown' || event.target.closest?.('[role=slider]')) changed = performance.now();
+    }, true);
+  }
   const send = () => {
-    const [next] = waiting;
-    sending = next ? setTimeout(send, 60) : 0;
-    if (!next) return;
+    const rest = changed + QUIET_MS - performance.now(), [next] = waiting;
+    sending = next && rest > 0 ? setTimeout(send, rest) : 0;
+    if (sending || !next) return;
     const [key, [name, word]] = next, bridge = document.querySelector(`.hs-bridge[data-name="${name}"]`);
     waiting.delete(key);
-    const input = bridge?.parentElement.previousElementSibling.querySelector('input');
-    if (!input) return; // taken off the page meanwhile
-    set.call(input, word + ' #' + (++said) + Math.random().toString(36).slice(2, 6));
-    input.dispatchEvent(new Event('input', {bubbles: true}));
+    const input = bridge?.parentElement.previousElementSibling.querySelector('input'); // or it was taken off the page
+    if (input) {
+      set.call(input, word + ' #' + (++said) + Math.random().toString(36).slice(2, 6));
+      input.dispatchEvent(new Event('input', {bubbles: true}));
+    }
+    send();
   };
   window.hemislamSay = (event) => {
     const element = event.target.closest && event.target.closest('[data-hs]');
