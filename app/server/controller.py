@@ -130,7 +130,7 @@ class Controller:
             case KeptCommand():
                 self._keep(changed(self._kept, command, self._need_session().frame))
             case protocol.Georeference(survey):
-                self._need_session().survey = survey
+                self._georeferencing.choose(self._need_session(), survey)
             case protocol.SetParams(values):
                 self._set_params(self._params.with_values(values))
             case protocol.LoadParams(text):

@@ -19,10 +19,17 @@ class Georeferencing:
     """Begins the work in a thread of the session and takes in what comes of it; one thread calls `update`."""
 
     def __init__(self, page: Publisher) -> None:
-        self._page = page
+        self._page, self._earth = page, Earth()  # the latter as it is shown
         self._begun_from: tuple[object, ...] = (None, None, (), -1, None)  # what the newest was begun with
-        self._begun_with: Survey | None = None
         self._under_way: Future[Results] | None = None
+
+    def choose(self, session: Session, survey: Survey | None) -> None:
+        """Georeference by this from now on. The page knows it at once, what comes of it once that is found."""
+        before = self._earth if self._begun_from[0] is session else Earth()
+        session.survey = survey
+        source = survey and (survey.gnss, survey.control)
+        same = before.survey and (before.survey.gnss, before.survey.control) == source
+        self._put(Earth(survey, before.found if same else None))
 
     def update(self, session: Session, *, still: bool) -> bool:
         """Show what has come, and begin anew where that is called for. Returns whether work is under way.
@@ -33,7 +40,7 @@ class Georeferencing:
         if self._under_way is not None:
             if not self._under_way.done():
                 return True
-            self._take(session, self._under_way, self._begun_with)
+            self._take(session, self._under_way)
             self._under_way = None
         if session.loops is not None and not session.loops.idle:
             return False
@@ -47,13 +54,14 @@ class Georeferencing:
         if session.survey is None:
             self._show(session, Earth(), _levelling(session))
             return False
-        self._under_way, self._begun_with = session.georeference(), session.survey
+        self._under_way = session.georeference()
         return True
 
-    def _take(self, session: Session, work: Future[Results], survey: Survey | None) -> None:
-        if self._begun_from[0] is not session:
+    def _take(self, session: Session, work: Future[Results]) -> None:
+        """Show what it found, unless something else was chosen meanwhile."""
+        survey, error = session.survey, work.exception()
+        if self._begun_from[:2] != (session, survey):
             return
-        error = work.exception()
         if error is None:
             results = work.result()
             self._show(session, Earth(survey, results.found), results.adjustment)
@@ -66,6 +74,10 @@ class Georeferencing:
         if len(adjustment.T_map_odom) or len(session.adjustment.T_map_odom):
             session.adjustment = adjustment
             self._page.map_moved(session)
+        self._put(earth)
+
+    def _put(self, earth: Earth) -> None:
+        self._earth = earth
         self._page.put(earth=earth, urgent=True)
 
 

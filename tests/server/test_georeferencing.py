@@ -103,6 +103,20 @@ def test_a_map_is_georeferenced_by_the_fixes_of_its_recording_and_again_when_it_
     assert np.sqrt((off(bench, walk) ** 2).mean()) < 0.05
 
 
+def test_the_page_knows_at_once_what_was_chosen_last(bench: Laid) -> None:
+    """Else a control point that is picked while the one before is being laid would take that back."""
+    first, second = Survey(lever=LEVER), Survey(lever=LEVER, height="EPSG:5773")
+    found = bench.do(Georeference(first)).earth.found
+    bench.controller.handle(Georeference(replace(first, offset_s=0.08)))
+    bench.controller.work()
+    bench.controller.handle(Georeference(second))
+    assert (bench.see().earth.survey, bench.see().earth.found) == (second, found)
+    while (wait := bench.controller.work()) is not None:
+        assert bench.see().earth.survey == second, "also when what was chosen before is found"
+        time.sleep(wait)
+    assert bench.see().earth.found is not found is not None
+
+
 def test_a_fix_is_overridden_and_that_is_undone_as_a_loop_is(bench: Laid) -> None:
     bench.do(Georeference(Survey(lever=LEVER)))
     assert verdicts(bench.see())["30"]
