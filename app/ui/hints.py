@@ -50,7 +50,7 @@ HINTS: Final[dict[str, str]] = {
     "distance to plane": "Distance to the ground plane in cm; under σ · range it is ground.",
     "plane of its neighbours": "Slope of the plane through its nearest points, in degrees from level.",
     "thickness": "Scatter of the nearest points about their plane, RMS in mm.",
-    "nearest plane in the map": "Distance in mm to the plane of the map that the filter matched.",
+    "nearest point that the filter used": "Distance in mm of the nearest point in the filter to its plane in the map.",
     # live
     "LiDAR": "Scans received a second (Hz), and the age of the newest.",
     "IMU": "Samples received a second (Hz), and the age of the newest.",
