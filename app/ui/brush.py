@@ -64,12 +64,12 @@ class BrushPanel:
         self._mark = _MARKS.get(name)
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
-        result = snapshot.result
-        if not self._changes(snapshot.painted, result, self._mark, view.point_size):
+        result, playing = snapshot.result, snapshot.transport.playing
+        if not self._changes(snapshot.painted, result, self._mark, view.point_size, playing):
             return
         found = marks(snapshot.painted)
         self._undo.visible = bool(snapshot.painted)
-        self._rest.visible = self._radius.visible = self.painting
+        self._rest.visible, self._rest.disabled, self._radius.visible = self.painting, playing, self.painting
         self._save.visible = self._list.visible = bool(found)
         self._why.content = panel("quiet", self._words(snapshot, bool(found)))
         start_ns, rows = snapshot.recording.start_ns if snapshot.recording else None, []
@@ -81,7 +81,8 @@ class BrushPanel:
 
     def _words(self, snapshot: Snapshot, any_marks: bool) -> str:
         if self.painting:
-            return "Click points of the scan, or hold Shift and drag a rectangle. Marks belong to this frame only."
+            click = "Pause, then click" if snapshot.transport.playing else "Click"
+            return f"{click} points of the scan, or hold Shift and drag a rectangle. Marks belong to this frame only."
         if any_marks:
             return "Auto-tune uses these marks for Ground F1."
         return "Mark ground in a few frames, and Auto-tune finds the parameters that label them best."

@@ -107,6 +107,8 @@ def test_nothing_is_marked_while_it_plays(painting: Painting) -> None:
     painting.panel.choose("ground")
     snapshot = painting.engine.snapshot
     painting.engine.publish(transport=replace(snapshot.transport, playing=True))
+    painting.panel.draw(painting.engine.snapshot, View())
+    assert "Pause, then click" in painting.panel._why.content and painting.panel._rest.disabled
     painting.click(floor_point(painting))
     assert not painting.sent
 
