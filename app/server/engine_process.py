@@ -79,8 +79,7 @@ def run_loop(
     prepare: Callable[[Callable[[str, float], None]], None] | None = None,
 ) -> None:
     """As `main`, with the function that opens a recording and one that prepares it, reporting (name, fraction)."""
-    seen = {name: getattr(setup, name) for name in ("session", "notices", "frames", "chunks")}
-    page = Publisher(setup.params, **seen)
+    page = Publisher(setup.params, setup.seen)
     updates = Updates(owner, page)
     controller = Controller(
         page, setup.params, opener, resolve=setup.resolve, session_folder=setup.session_folder, kept=setup.kept

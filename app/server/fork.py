@@ -27,7 +27,7 @@ from app.mapping.session_file import (
 )
 from app.server.keeping import AddNote
 from app.server.protocol import Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
-from app.server.setup import Setup
+from app.server.setup import Seen, Setup
 from app.server.worker import RunningEngine
 from app.slam.errors import HemislamError
 from app.slam.text_files import free_path
@@ -257,8 +257,7 @@ class Workspace:
                 play=False,
                 breakpoints=Breakpoints(),
                 session_folder=folder.resolve(),
-                session=APART * self._forks,
-                notices=APART * self._forks,
+                seen=Seen(APART * self._forks, APART * self._forks),
                 live=None,
                 live_folder=None,
             )

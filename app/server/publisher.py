@@ -12,6 +12,7 @@ from typing import Any, Literal
 from app.mapping.session import Session
 from app.server.chunks import thinned
 from app.server.protocol import Delta, LoopsView, Notice, OpenedRecording, Saved, Transport
+from app.server.setup import NOTHING_SEEN, Seen
 from app.slam.frames import Frame
 from app.slam.log import Cursor, Log
 from app.slam.loops.types import LoopEdge, difference
@@ -49,26 +50,18 @@ class Publisher:
     """Turns a session's events into deltas.
 
     Args:
-        session, notices, frames, chunks: how many the reader already has from an earlier process.
+        seen: what the reader already has.
 
     Attributes:
         urgent: asks for the next delta at once, whatever the rate limit.
         transport: as last shown. result: of the frame that is shown, without its keyframe.
     """
 
-    def __init__(
-        self,
-        params: Params,
-        *,
-        session: int = 0,
-        notices: int = 0,
-        frames: int = 0,
-        chunks: int = 0,
-    ) -> None:
+    def __init__(self, params: Params, seen: Seen = NOTHING_SEEN) -> None:
         self.transport = Transport()
         self.result: StepResult | None = None
         self.urgent = True
-        self._session, self._notices_given = session, notices
+        self._session, self._notices_given = seen.session, seen.notices
         self._replaced: dict[str, Any] = {"params": params}
         self._corrections = MapFrame()
         self._noticed: dict[str, int] = {}
@@ -78,9 +71,9 @@ class Publisher:
         self._clouds: Keyframes = ()
         # What the reader has:
         self._edges: tuple[LoopEdge, ...] = ()
-        self._cursor = Cursor(0, frames)
+        self._cursor = Cursor(0, seen.frames)
         self._keyframes: list[int] = []  # their frames
-        self._chunks = chunks
+        self._chunks = seen.chunks
         self._again: set[int] = set()  # chunks to send again
 
     def put(self, *, urgent: bool = False, **values: Any) -> None:

@@ -16,6 +16,19 @@ HELD = 7
 
 
 @dataclass(frozen=True, slots=True)
+class Seen:
+    """How many the reader already has from an earlier process; sessions and notices are numbered on from there."""
+
+    session: int = 0
+    notices: int = 0
+    frames: int = 0
+    chunks: int = 0
+
+
+NOTHING_SEEN = Seen()
+
+
+@dataclass(frozen=True, slots=True)
 class Setup:
     """What an engine's process starts with. Must be picklable.
 
@@ -24,8 +37,7 @@ class Setup:
         resolve, session_folder: see `Controller`. play: begin at once.
         point_budget: most points of the map that a page draws. checkpoint_bytes: memory for checkpoints.
         live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: keeps what a process that takes
-            over needs. revive: this process takes over.
-        session, notices, frames, chunks: how many there were before, if this process takes over.
+            over needs. revive: this process takes over. seen: by the reader, before.
         kept: by a live session that another process began.
     """
 
@@ -44,8 +56,5 @@ class Setup:
     live_folder: Path | None = None
     revive: bool = False
     session_folder: Path | None = None
-    session: int = 0
-    notices: int = 0
-    frames: int = 0
-    chunks: int = 0
+    seen: Seen = NOTHING_SEEN
     kept: Kept = NOTHING_KEPT

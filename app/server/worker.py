@@ -13,7 +13,7 @@ from app.child import Child, ChildDied, Link, RestartLimit
 from app.mapping.kept import Kept
 from app.server.fold import Fold
 from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecording, Progress, Restart, Snapshot
-from app.server.setup import HELD, Setup
+from app.server.setup import HELD, Seen, Setup
 
 MOST_RESTARTS: Final = 25
 """Deaths of the engine's process after which it is started again without being asked."""
@@ -131,8 +131,8 @@ class EngineProcess:
         self._edit(notices=notices, progress=Progress("Starting the engine again", math.nan))
         on_the_way = last.progress is not None or last.transport.frame < 0  # to the frame of the process before
         setup = self._next_setup(play=self._started_with.play if on_the_way else last.transport.playing)
-        frames, chunks = len(last.trajectory), len(last.chunks)
-        self._start(replace(setup, recording=place, revive=True, frames=frames, chunks=chunks))
+        seen = replace(setup.seen, frames=len(last.trajectory), chunks=len(last.chunks))
+        self._start(replace(setup, recording=place, revive=True, seen=seen))
 
     def _next_setup(self, *, play: bool) -> Setup:
         """What the next process starts with: parameters and settings as they are now."""
@@ -143,8 +143,7 @@ class EngineProcess:
             play=play,
             speed=last.transport.speed,
             breakpoints=last.breakpoints,
-            session=last.session,
-            notices=last.last_notice,
+            seen=Seen(last.session, last.last_notice),
             kept=Kept(**last.kept()),
         )
 

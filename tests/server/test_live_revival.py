@@ -28,6 +28,7 @@ from app.server.controller import Controller
 from app.server.fold import Fold
 from app.server.protocol import LIVE, Snapshot
 from app.server.publisher import Publisher
+from app.server.setup import Seen
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
@@ -63,12 +64,8 @@ class Bench:
 
     def begin(self, *, revive: bool = True) -> None:
         page = self.page
-        self.publisher = Publisher(
-            self._params,
-            session=page.session,
-            frames=len(page.trajectory),
-            chunks=len(page.chunks),
-        )
+        seen = Seen(page.session, frames=len(page.trajectory), chunks=len(page.chunks))
+        self.publisher = Publisher(self._params, seen)
 
         def opened(*_: object) -> Session:
             self.session = open_live_session(self._address, LIVE, self._params, self._folder, take_over=revive)

@@ -48,7 +48,7 @@ def starter(columns: int) -> Callable[[Setup], FakeEngine]:
         b = FakeEngine(columns=columns)
         b.world = Drifting(columns, session.frame)
         b.send(SetParams(Params().changed(session.state.params)))
-        b.publish(session=setup.session + 1, session_file=setup.recording)
+        b.publish(session=setup.seen.session + 1, session_file=setup.recording)
         b.send(Seek(session.frame))
         return b
 
