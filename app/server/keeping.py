@@ -28,7 +28,7 @@ class AddNote(KeptCommand, frozen=True):
 class EditNote(KeptCommand, frozen=True):
     """Replace the text of the note with this place in `Snapshot.notes`; an empty text deletes it.
 
-    before: its text until now. If another page has changed it meanwhile, nothing happens.
+    before: its text until now. If another page has changed it meanwhile, it stays as it is.
     """
 
     place: int
@@ -78,7 +78,11 @@ class UndoPaint(KeptCommand, frozen=True):
 
 
 def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
-    """The same after a command, given at a frame. Raises HemislamError: there are too many notes, or as `Clip`."""
+    """The same after a command, given at a frame.
+
+    Raises:
+        HemislamError: there are too many notes, another page has changed what is edited, or as `Clip`.
+    """
     notes, measures = kept.notes, kept.measures
     match command:
         case AddNote(text) if text.strip():
@@ -88,11 +92,17 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
         case EditNote(place, before, text) if 0 <= place < len(notes) and notes[place].text == before:
             now = (Note(notes[place].frame, text.strip()),) if text.strip() else ()
             return replace(kept, notes=(*notes[:place], *now, *notes[place + 1 :]))
+        case EditNote(text=text) if text.strip():
+            raise HemislamError(
+                f"Another page has changed that note meanwhile; it was not replaced by “{text.strip()}”."
+            )
         case KeepView(view):
             return replace(kept, views=(*kept.views, view)[-MOST_VIEWS:])
         case KeepMeasure(measure):
             return replace(kept, measures=(*measures, measure)[-MOST_MEASURES:])
         case RenameMeasure(measure, name):
+            if measure not in measures:
+                raise HemislamError(f"Another page has changed that measure meanwhile; it was not renamed to “{name}”.")
             renamed = replace(measure, name=name)
             return replace(kept, measures=tuple(renamed if one == measure else one for one in measures))
         case DropMeasure(measure):
