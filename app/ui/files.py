@@ -13,7 +13,7 @@ from app.export.exports import BY_RUN, EXPORTS, FORMATS
 from app.export.points import Choice
 from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
-from app.server.protocol import CompareWith, OpenRecording, Save, Snapshot
+from app.server.protocol import CompareWith, OpenRecording, Restart, Save, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
@@ -68,7 +68,7 @@ def folder_name(typed: str) -> str:
 
 
 class RecentPanel:
-    """What to go on with: the last session and, while none is open, recordings opened before.
+    """What to go on with: the last session and, while none is open, recordings opened before; an engine that has ended.
 
     Args:
         kept: folder of the session files. browse: asks for a recording.
@@ -79,6 +79,9 @@ class RecentPanel:
         self._sessions: list[tuple[Path, SavedSession]] = []
         self._changes = Changes()
         self._bridge = Bridge(page.gui, "last", self._open_last)
+        self._restart = add_button(
+            page.gui, "Start the engine again", lambda _: page.send(Restart()), viser.Icon.REFRESH, visible=False
+        )
         self._last = page.gui.add_html("")  # it stays as long as the recording is open, so that nothing below moves
         self._browse = add_button(
             page.gui, "Open a recording…", browse, viser.Icon.FOLDER_OPEN, color=None, visible=False
@@ -93,7 +96,7 @@ class RecentPanel:
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording
         nothing = recording is None and snapshot.progress is None
-        self._browse.visible = nothing and snapshot.engine_alive
+        self._browse.visible, self._restart.visible = nothing and snapshot.engine_alive, not snapshot.engine_alive
         if self._changes(snapshot.session, snapshot.session_file):
             present, found = snapshot.session_file, self._folders.sessions(self._kept)
             own = recording.path.resolve() if recording is not None else None

@@ -13,7 +13,7 @@ import viser
 from app.mapping.kept import Note
 from app.mapping.session_file import Opened, SavedSession, State, write_session
 from app.server.folders import Folders
-from app.server.protocol import Command, OpenedRecording, OpenRecording, Snapshot, Transport
+from app.server.protocol import Command, OpenedRecording, OpenRecording, Restart, Snapshot, Transport
 from app.slam.loops.edits import Reject
 from app.slam.params import Params
 from app.ui.files import RecentPanel
@@ -67,3 +67,15 @@ def test_without_a_recording_those_of_before_are_offered_too(server: viser.Viser
     assert labels == ["Restore last session", "Open hall.mcap", "Open walk.mcap"]
     user_clicks(panel._buttons[2])
     assert sent == [OpenRecording((kept.parent / "open/walk.mcap").resolve(), None)]
+
+
+def test_an_engine_that_has_ended_for_good_is_started_again_by_a_button(server: viser.ViserServer, kept: Path) -> None:
+    sent: list[Command] = []
+    panel = RecentPanel(page_of(server, sent.append), Folders([kept.parent / "open"]), kept, lambda *_: None)
+    start = opened(kept.parent / "open/walk.mcap", 0)
+    panel.draw(start)
+    assert not panel._restart.visible
+    panel.draw(replace(start, engine_alive=False))
+    assert panel._restart.visible
+    user_clicks(panel._restart)
+    assert sent == [Restart()]
