@@ -93,6 +93,7 @@ class AddLoopPanel:
         self._changes = Changes()  # of the dots
         self._picked: list[int] | None = None
         self._nudging: Nudging | None = None
+        self._tried = False  # with keyframes that cannot be
         gui.add_html(panel("text", "Tell the graph that two keyframes see the same place, whatever the search found."))
         self._older = limited(gui.add_number("older keyframe", 0, min=0, step=1))
         self._newer = limited(gui.add_number("newer keyframe", 0, min=0, step=1))
@@ -130,14 +131,19 @@ class AddLoopPanel:
         show(self._nudge, False)
 
     def suggest(self) -> None:
-        older, newer = self.pair
-        count = len(self._page.snapshot().keyframe_poses)
-        good = 0 <= older < newer < count
-        self._problem.visible = not good
-        if good:
+        self._tried = True
+        if self._is_possible(len(self._page.snapshot().keyframe_poses)):
+            older, newer = self.pair
             self._propose(Add(older, newer, self._guess(), self._register.value))
-        else:
-            self._problem.content = panel("text", f"Choose two of the {count} keyframes, the older one first.")
+
+    def _is_possible(self, count: int) -> bool:
+        """Whether the two are among the first `count` keyframes; if something is to be done with them, says so."""
+        older, newer = self.pair
+        good = 0 <= older < newer < count
+        self._tried &= not good
+        self._problem.visible = not good and (self._tried or self._nudge.value)
+        self._problem.content = panel("text", f"Choose two of the {count} keyframes, the older one first.")
+        return good
 
     def pick(self, origin: F64, direction: F64) -> None:
         """A click while picking; the ray is in the map."""
@@ -154,7 +160,7 @@ class AddLoopPanel:
         """Called by the drawing thread, often: dots to pick from, the two clouds, and the guess once it rests."""
         self._draw_picking(snapshot)
         poses, pair, nudging = snapshot.keyframe_poses, self.pair, self._nudging
-        wanted = self._nudge.value and 0 <= pair[0] < pair[1] < len(poses)
+        wanted = self._is_possible(len(poses)) and self._nudge.value
         if nudging is not None and (not wanted or nudging.pair != pair):
             nudging.gizmo.remove()
             self._overlay.draw(None, None, view.point_size)
