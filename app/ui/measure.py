@@ -89,8 +89,8 @@ class MeasurePanel:
         drawn = str([at.round(3).tolist() for _, at in where])
         self._where = current.earth.found.reference if current.earth.found is not None else None
         later = len(kept) - len(where)
-        due = current.measures, self._kind, str(self._spots), drawn, later, current.session, self._where, view.light
-        if self._changes(*due):
+        due = current.measures, self._kind, str(self._spots), drawn, later, current.session, self._where
+        if self._changes(*due, view.light, view.map):
             self._light = view.light
             map_ = current.chunks, current.keyframe_poses
             same = all(before is now for before, now in zip(self._map, map_, strict=True))
@@ -100,7 +100,7 @@ class MeasurePanel:
                 (measure, at, known.get(measure) or numbers(at, current.chunks, poses)) for measure, at in where
             ]
             self._draw_scene(begun)
-            self._draw_list(later)
+            self._draw_list(later, view.map)
 
     def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
         if kind == PICK:
@@ -134,7 +134,7 @@ class MeasurePanel:
         for number, place in enumerate(begun if begun is not None else ()):  # a label is seen whatever is before it
             self._nodes.append(scene.add_label(f"{ROOT}/measures/begun/{number}", f"{number + 1}", position=place))
 
-    def _draw_list(self, later: int) -> None:
+    def _draw_list(self, later: int, map_shown: bool) -> None:
         """later: how many measures are on a part of the walk that is not here yet."""
         left = _SPOTS.get(self._kind, 0) - len(self._spots)
         self._kinds.options = (
@@ -142,9 +142,10 @@ class MeasurePanel:
             *([STOP] if self.picking else []),
         )
         points = f"{left}{' more' if self._spots else ''} point{'s' if left > 1 else ''}"
-        asked = f"{self._kind.capitalize()}: click {points} of the map."
-        self._asked.content = panel("text", asked) if left else ""
-        self._asked.visible = bool(left)
+        asked = f"{self._kind.capitalize()}: click {points} of the map." if left else ""
+        if self.picking and not map_shown:
+            asked = "The map is hidden; show it to click its points."
+        self._asked.content, self._asked.visible = panel("text", asked), bool(asked)
         rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]
         waiting = f"{later} more on a part of the walk that is not here at this frame." if later else ""
         self._list.content = self._bridge.live(panel("measures", rows, waiting)) if rows or later else ""

@@ -156,6 +156,19 @@ def test_a_click_beside_the_map_is_not_taken_and_stop_ends_it(server: viser.Vise
     assert not bench.sent and not bench.panel._asked.visible
 
 
+def test_while_the_map_is_hidden_the_panel_says_why_no_click_counts(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    for begin in (lambda: bench.panel.begin(POINT), lambda: bench.panel.pick(lambda *_: None)):
+        begin()
+        bench.panel.draw(bench.now, View(map=False))
+        assert bench.panel._asked.visible and "The map is hidden" in bench.panel._asked.content
+        bench.panel.draw(bench.now, View())
+        assert "The map is hidden" not in bench.panel._asked.content
+    bench.panel.begin(STOP)
+    bench.panel.draw(bench.now, View(map=False))
+    assert not bench.panel._asked.visible
+
+
 def test_the_active_tool_and_each_point_clicked_are_marked(server: viser.ViserServer, wire: Wire) -> None:
     bench = Bench(server)
     bench.panel.draw(bench.now, View())
