@@ -12,8 +12,10 @@ import viser
 
 from app.evaluation.cloud_distance import compare
 from app.server.folders import Folders
+from app.server.fork import Workspace
 from app.server.keeping import KeepMeasure
 from app.server.protocol import Chunk, Command, Snapshot
+from app.server.setup import Setup
 from app.slam.types import F64
 from app.ui.measure import POINT
 from app.ui.workbench import Workbench
@@ -79,7 +81,8 @@ def _clicks(rng: np.random.Generator) -> list[float]:
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     found = []
     with TemporaryDirectory() as folder:
-        workbench = Workbench(server, engine, Folders([Path(folder)]))
+        forks = Workspace(engine, Setup(), lambda _: engine)
+        workbench = Workbench(server, forks, Folders([Path(folder)]))
         workbench.start()
         with listening(f"http://127.0.0.1:{server.get_port()}/") as page:
             _until(lambda: workbench._scene.chunks.points > 0)

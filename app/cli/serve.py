@@ -132,7 +132,7 @@ def serve(
     elif recording is not None:
         truth = truth_beside(recording)
 
-    def build_page(viser: Any, engine: Any, folders: Folders) -> ServedPage:
+    def build_page(viser: Any, forks: Any, folders: Folders) -> ServedPage:
         """While the engine opens the recording too. A mistake in it is reported here, not in the page."""
         if recording is not None:
             open_recording(opened, params).close()
@@ -140,7 +140,7 @@ def serve(
 
         return Workbench(
             viser,
-            engine,
+            forks,
             folders,
             point_budget=point_budget,
             results=Path("runs"),

@@ -19,8 +19,7 @@ import viser
 from app.server.folders import Folders
 from app.server.fork import Workspace
 from app.server.protocol import Snapshot
-from app.server.setup import POINT_BUDGET, Setup
-from app.server.worker import RunningEngine
+from app.server.setup import POINT_BUDGET
 from app.slam.params import Params
 from app.ui.appearance import AppearancePanel, apply_theme
 from app.ui.brush import BrushPanel
@@ -63,7 +62,7 @@ class Workbench:
     """Builds the page on `server`; `start` begins to draw, `close` ends it.
 
     Args:
-        server: whose page this is. engine: where snapshots come from and commands go; a `Workspace` can be forked.
+        server: whose page this is. forks: where snapshots come from and commands go.
         folders: where recordings may be opened from. point_budget: of the engine's reader, shown to the user.
         results: folder below which results are saved.
         now: monotonic seconds. calibrate: begin calibrations without being asked, where they help.
@@ -73,7 +72,7 @@ class Workbench:
     def __init__(
         self,
         server: viser.ViserServer,
-        engine: RunningEngine | Workspace,
+        forks: Workspace,
         folders: Folders,
         point_budget: int = POINT_BUDGET,
         *,
@@ -82,9 +81,8 @@ class Workbench:
         calibrate: bool = False,
         resolve: Callable[..., Params] | None = None,
     ) -> None:
-        forks = engine if isinstance(engine, Workspace) else Workspace(engine, Setup(), lambda _: engine)
         self._server = server
-        self._engine = engine
+        self._forks = forks
         self._budget = point_budget
         gui = server.gui
         apply_theme(gui, light=False)
@@ -92,7 +90,7 @@ class Workbench:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(360)
         self._scene = Scene(server, point_budget)
-        page = Page(server, engine.send, lambda: engine.snapshot, now, lambda: self._scene.offset)
+        page = Page(server, forks.send, lambda: forks.snapshot, now, lambda: self._scene.offset)
 
         prepare_page(gui)
         self._header, scale = HeaderPanel(gui), ScaleBars(page)
@@ -108,8 +106,8 @@ class Workbench:
         with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._sides = Sides(gui, forks)
             tuned = replace(page, send=self._sides.send)
-            self._parameters = ParameterPanel(tuned, engine.snapshot.params)
-            add_yaml_buttons(tuned, lambda: self._sides.tuned(engine.snapshot).params)
+            self._parameters = ParameterPanel(tuned, forks.snapshot.params)
+            add_yaml_buttons(tuned, lambda: self._sides.tuned(forks.snapshot).params)
         with tabs.add_tab("Readouts", viser.Icon.CHART_LINE):
             self._readouts = ReadoutPanel(page)
             with gui.add_folder("Pause when", expand_by_default=False):
@@ -180,7 +178,7 @@ class Workbench:
     def _run(self) -> None:
         revision = -1
         while not self._stop.is_set():
-            snapshot = self._engine.wait(revision, _TICK_S)
+            snapshot = self._forks.wait(revision, _TICK_S)
             revision = snapshot.revision
             try:
                 self.draw(snapshot)

@@ -17,9 +17,11 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from app.server.folders import Folders
+from app.server.fork import Workspace
 from app.ui.workbench import Workbench
 from tests.ui.conftest import icons_read_once  # noqa: F401 - a fixture
 from tests.ui.fake_engine import FakeEngine
+from tests.ui.fake_forks import alone
 
 ARGS = (
     "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -164,7 +166,8 @@ def opened(
         camera: where it is at first, and what it looks at.
     """
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    workbench = Workbench(server, engine, Folders([folder]))
+    forks = engine if isinstance(engine, Workspace) else alone(engine)
+    workbench = Workbench(server, forks, Folders([folder]))
     workbench.start()
     page = new_page(chromium, width, height)
     url = f"http://127.0.0.1:{server.get_port()}/"

@@ -31,6 +31,11 @@ class Drifting(World):
         return turn @ super().rotation(frame)
 
 
+def alone(engine: FakeEngine) -> Workspace:
+    """Of an engine that is not forked."""
+    return Workspace(engine, Setup(), lambda _: engine)  # type: ignore[arg-type, return-value]
+
+
 def workspace(a: FakeEngine, folder: Path, columns: int = 40) -> Workspace:
     """`a` can be forked; files go to the folder."""
     path = folder / "a.hemislam"

@@ -35,6 +35,7 @@ from app.ui.transport import BreakpointPanel
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, page_of, user_sets
 from tests.ui.fake_engine import START_NS, FakeEngine
+from tests.ui.fake_forks import alone
 
 HOUR = 36_000
 
@@ -253,7 +254,7 @@ def test_a_moved_slider_reaches_the_scene_before_the_curve(
     server: viser.ViserServer, wire: Wire, engine: FakeEngine, tmp_path: Path
 ) -> None:
     clock = Clock()
-    workbench = Workbench(server, engine, Folders([tmp_path]), now=clock)
+    workbench = Workbench(server, alone(engine), Folders([tmp_path]), now=clock)
     engine.send(StepFrame(3))
     workbench.draw(engine.snapshot)
     wire.clear()

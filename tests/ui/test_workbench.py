@@ -22,13 +22,14 @@ from app.ui.readouts import HISTORY
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, clouds, user_sets
 from tests.ui.fake_engine import FakeEngine
+from tests.ui.fake_forks import alone
 
 
 class Page:
     def __init__(self, server: viser.ViserServer, engine: FakeEngine, folder: Path) -> None:
         self.clock = Clock()
         self.engine = engine
-        self.workbench = Workbench(server, engine, Folders([folder]), now=self.clock)
+        self.workbench = Workbench(server, alone(engine), Folders([folder]), now=self.clock)
 
     def draw(self, seconds: float = 0.0) -> None:
         self.clock.now += seconds

@@ -13,6 +13,7 @@ from app.slam.loops.types import Verdict
 from app.ui.loops.panel import LoopsPanel
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock
+from tests.ui.fake_forks import alone
 from tests.ui.fake_loops import LoopEngine
 
 GOOD, WAITING = (12, 89), (34, 112)
@@ -24,7 +25,7 @@ class Page:
         self.clock = Clock()
         self.server = server
         self.engine = LoopEngine()
-        self.workbench = Workbench(server, self.engine, Folders([folder]), now=self.clock)
+        self.workbench = Workbench(server, alone(self.engine), Folders([folder]), now=self.clock)
         self.loops: LoopsPanel = self.workbench._loops
         self.draw()
         self.engine.sent.clear()
