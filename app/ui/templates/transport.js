@@ -44,16 +44,16 @@ const columnOf = (frame) => {
 const say = (text, x, y, colour, align = 'left') => {
   pen.fillStyle = colour; pen.textAlign = align; pen.fillText(text, x, y);
 };
-function draw() {
-  const ratio = window.devicePixelRatio || 1, W = canvas.clientWidth, rows = d ? d.strips.length + 1 : 0;
-  const H = HEAD + ROW * rows + 2;
-  if (!W) return;
-  canvas.style.height = H + 'px';
-  if (canvas.width !== Math.round(W * ratio) || canvas.height !== Math.round(H * ratio)) {
-    canvas.width = Math.round(W * ratio); canvas.height = Math.round(H * ratio);
-  }
+const cleared = (canvas, pen) => { // with as many pixels as the screen has; its width and height in those of CSS
+  const ratio = window.devicePixelRatio || 1, W = canvas.clientWidth, H = canvas.clientHeight;
+  canvas.width = Math.round(W * ratio); canvas.height = Math.round(H * ratio);
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  pen.clearRect(0, 0, W, H);
+  return [W, H];
+};
+function draw() {
+  canvas.style.height = HEAD + ROW * (d ? d.strips.length + 1 : 0) + 2 + 'px';
+  const [W, H] = cleared(canvas, pen);
+  if (!W) return;
   pen.font = '10.5px system-ui, sans-serif';
   pen.textBaseline = 'middle';
   say(d ? 'Diagnostics' : 'Diagnostics appear with the first frame.', 8, HEAD / 2, TEXT);
@@ -150,11 +150,8 @@ canvas.onpointerup = (event) => { if (scrubbing) { scrubbing = false; ask(frameA
 canvas.onpointerleave = () => { if (!scrubbing) { hover = null; draw(); } };
 // --- the bar
 const mark = () => { // above the track: loops, notes and where trouble begins
-  const ratio = window.devicePixelRatio || 1, W = marks.clientWidth, H = marks.clientHeight, edge = 8;
-  if (!W) return;
-  marks.width = Math.round(W * ratio); marks.height = Math.round(H * ratio);
-  ink.setTransform(ratio, 0, 0, ratio, 0, 0);
-  if (!d) return;
+  const [W, H] = cleared(marks, ink), edge = 8;
+  if (!W || !d) return;
   const X = (frame) => edge + (frame + 0.5) / d.frames * (W - 2 * edge);
   const bar = (frame, colour, high) => { ink.fillStyle = colour; ink.fillRect(X(frame) - 1.25, 0, 2.5, high); };
   const lines = (colour, points, fill) => { // told apart by shape as well as by colour
