@@ -7,7 +7,7 @@ import viser
 from app.ui.colours import COLOUR_BY, LABEL, Key, Limits, Rgb, key, legend
 from app.ui.html import panel
 from app.ui.scale import Looks
-from app.ui.widgets import View, choose_next, show
+from app.ui.widgets import View, add_command, choose_next, show
 
 _ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
 """On a dark and on a light background."""
@@ -69,10 +69,9 @@ class AppearancePanel:
                 name: gui.add_checkbox(text, getattr(default, name), hint=hint) for name, text, hint in _LAYERS
             }
         self._count = gui.add_html("")
-        gui.add_command("Follow the sensor or look freely", hotkey="F").on_trigger(
-            lambda _: show(self._follow, not self._follow.value)
-        )
-        gui.add_command("Next colour mode", hotkey="C").on_trigger(lambda _: choose_next(self._colour_by))
+        following = "Follow the sensor or look freely"
+        add_command(gui, following, lambda _: show(self._follow, not self._follow.value), hotkey="F")
+        add_command(gui, "Next colour mode", lambda _: choose_next(self._colour_by), hotkey="C")
 
     @property
     def view(self) -> View:

@@ -12,7 +12,7 @@ import viser
 from app.server.keeping import KeepView
 from app.server.protocol import Snapshot
 from app.slam.types import F64
-from app.ui.widgets import Changes, Page, add_button, by_user
+from app.ui.widgets import Changes, Page, add_button, add_command, by_user
 
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
@@ -251,9 +251,7 @@ class CameraPanel:
             "kept views", ("1",), visible=False, hint="Go back to a view that was kept in this session."
         )
         self._list.on_click(by_user(lambda name, client: self._return(client, int(name) - 1)))
-        gui.add_command("Frame the whole map", hotkey="G").on_trigger(
-            lambda event: self.look(FIT, event.client) if event.client else None
-        )
+        add_command(gui, "Frame the whole map", lambda client: self.look(FIT, client), hotkey="G")
 
     def look(self, way: str, client: viser.ClientHandle) -> None:
         """Show the whole map from one side, also as it grows."""

@@ -4,7 +4,6 @@
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from app.ui.widgets import (
     Page,
     View,
     add_button,
+    add_command,
     by_user,
     chart,
     dialog,
@@ -49,7 +49,7 @@ class Sides:
         self._choice = gui.add_dropdown(
             "act on", ("A", "B"), initial_value="A", visible=False, hint="Whose parameters these are. T changes it."
         )
-        gui.add_command("Parameters of A or of its fork B", hotkey="T").on_trigger(lambda _: self._other())
+        add_command(gui, "Parameters of A or of its fork B", lambda _: self._other(), hotkey="T")
 
     @property
     def on_b(self) -> bool:
@@ -72,7 +72,9 @@ class Sides:
             self._forks.send(command)
 
     def _other(self) -> None:
-        self.choose("A" if self._choice.value == "B" or self._forks.other is None else "B")
+        if self._forks.other is None:
+            raise HemislamError("There is no fork; fork first.")
+        self.choose("A" if self._choice.value == "B" else "B")
 
 
 class CompareScene:
@@ -143,7 +145,7 @@ class ComparePanel:
         with self._comparison:
             self._add_comparison(gui)
         self._what.on_click(by_user(self._act))
-        gui.add_command("Swap A and its fork B", hotkey="X").on_trigger(lambda _: self._swap_if_any())
+        add_command(gui, "Swap A and its fork B", lambda _: forks.swap(), hotkey="X")
 
     def _add_comparison(self, gui: viser.GuiApi) -> None:
         gui.add_html(maths.legend())
@@ -250,11 +252,6 @@ class ComparePanel:
     def _open_beside(self, path: Path, close: Callable[[], None], _: viser.ClientHandle) -> None:
         close()
         self._forks.open(path)
-
-    def _swap_if_any(self) -> None:
-        if self._forks.other is not None:
-            with suppress(HemislamError):  # B has no frame yet: its status says so
-                self._forks.swap()
 
 
 def _curves(found: maths.Difference) -> "list[tuple[Any, ...] | None]":

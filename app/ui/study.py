@@ -36,6 +36,7 @@ from app.ui.widgets import (
     Changes,
     Page,
     View,
+    add_command,
     by_user,
     chart,
     choose_next,
@@ -132,9 +133,7 @@ class StudyPanel:
         gui.add_html(heading("Download this frame with all its points' numbers"))
         self._save = gui.add_button_group("save", ("PLY", "PCD"), hint="In the LiDAR frame.")
         self._save.on_click(by_user(self._download))
-        gui.add_command("Next colour mode of the frame under study", hotkey="V").on_trigger(
-            lambda _: choose_next(self._by)
-        )
+        add_command(gui, "Next colour mode of the frame under study", lambda _: choose_next(self._by), hotkey="V")
 
     def seen(self, view: View) -> View:
         """The view without what stands in the way of the study."""

@@ -13,10 +13,11 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from app.server.protocol import Seek, Snapshot
+from app.slam.errors import HemislamError
 from app.slam.loops.types import Pair, Verdict
 from app.slam.types import F64, I64
 from app.ui.html import panel
-from app.ui.widgets import Changes, Page
+from app.ui.widgets import Changes, Page, add_command
 
 _PERIOD_S: Final = 0.5
 COLUMNS: Final = 480
@@ -225,8 +226,8 @@ class TimelinePanel:
         self._changes = Changes(page.now, _PERIOD_S)
         self._latest = Snapshot()
         self._data = gui.add_html(panel("timeline_data", ""))
-        gui.add_command("Go to the next problem", hotkey="N").on_trigger(lambda _: self._jump(1))
-        gui.add_command("Go to the previous problem", hotkey="B").on_trigger(lambda _: self._jump(-1))
+        add_command(gui, "Go to the next problem", lambda _: self._jump(1), hotkey="N")
+        add_command(gui, "Go to the previous problem", lambda _: self._jump(-1), hotkey="B")
 
     def draw(self, snapshot: Snapshot) -> None:
         """Called often; sends what changed, at most twice a second."""
@@ -245,5 +246,6 @@ class TimelinePanel:
         snapshot = self._page.snapshot()
         here, frames = snapshot.transport.frame, self._history.troubles(limits(snapshot))
         there = next((frame for frame in frames[::by] if (frame - here) * by > 0), None)
-        if there is not None:
-            self._page.send(Seek(there))
+        if there is None:
+            raise HemislamError(f"The diagnostics show no problem {'after' if by > 0 else 'before'} this frame.")
+        self._page.send(Seek(there))

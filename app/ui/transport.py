@@ -21,7 +21,7 @@ from app.server.protocol import (
 )
 from app.ui.html import number, panel, source
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, as_set, limited, show
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_command, as_set, limited, show
 
 SPEEDS: Final = {
     "0.1×": 0.1,
@@ -57,10 +57,10 @@ class TransportPanel:
         self._bridge = Bridge(gui, "transport", self._asked)
         gui.add_html(self._bridge.live(panel("transport", list(SPEEDS), source("transport.js"))))
         self._state = gui.add_html("")
-        gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self.toggle())
+        add_command(gui, "Play or pause", lambda _: self.toggle(), hotkey="space")
         # Their keys are in `viser_adapter.js`: the list of commands would show them as "arrowright".
-        gui.add_command("Step one frame (→)").on_trigger(lambda _: send(StepFrame()))
-        gui.add_command("Step one frame back (←)").on_trigger(lambda _: send(StepFrame(-1)))
+        add_command(gui, "Step one frame (→)", lambda _: send(StepFrame()))
+        add_command(gui, "Step one frame back (←)", lambda _: send(StepFrame(-1)))
 
     def toggle(self) -> None:
         self._send(Pause() if self._snapshot().transport.playing else Play())

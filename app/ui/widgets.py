@@ -244,6 +244,22 @@ def add_button(
     return button
 
 
+def add_command(gui: viser.GuiApi, text: str, act: Callable[[viser.ClientHandle], None], **key: Any) -> None:
+    """A command in the page's list, also by its key; `act` is called with the browser that gave it.
+
+    A HemislamError that it raises, because there is nothing to be done, is shown there for a while.
+    """
+
+    def given(event: viser.CommandEvent) -> None:
+        if event.client is not None:
+            try:
+                act(event.client)
+            except HemislamError as error:
+                event.client.add_notification("Note", str(error), auto_close_seconds=6.0)
+
+    gui.add_command(text, **key).on_trigger(given)
+
+
 def as_set(
     act: Callable[[Any, viser.ClientHandle], None],
 ) -> Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]:

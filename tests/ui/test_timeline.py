@@ -29,6 +29,7 @@ from app.server.protocol import (
     Transport,
 )
 from app.slam import iekf
+from app.slam.errors import HemislamError
 from app.slam.loops.types import Evidence, LoopEdge, Verdict
 from app.ui.timeline import COLUMNS, DEGENERATE_CM, STRIPS, History, TimelinePanel, limits, message, packed
 from app.ui.transport import BreakpointPanel
@@ -248,6 +249,9 @@ def test_keys_go_to_the_next_trouble_and_to_the_one_before(bench: Bench) -> None
     bench.panel._jump(1)
     bench.panel._jump(-1)
     assert bench.sent == [Seek(30), Seek(10)]
+    bench.engine.publish(transport=replace(bench.engine.snapshot.transport, frame=0))
+    with pytest.raises(HemislamError, match="no problem before this frame"):
+        bench.panel._jump(-1)
 
 
 def test_a_moved_slider_reaches_the_scene_before_the_curve(

@@ -5,12 +5,14 @@ Tests app/ui/widgets.py.
 
 import ast
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import viser
 
-from app.ui.widgets import by_user, limited
+from app.slam.errors import HemislamError
+from app.ui.widgets import add_command, by_user, limited
 from tests.ui.conftest import BusyThreads, Wire, browser_sends
 
 APP = Path(__file__).parents[2] / "app"
@@ -54,3 +56,18 @@ def test_every_box_with_limits_keeps_to_them() -> None:
                 case ast.Call(func=ast.Name(id="limited"), args=[ast.Call() as box]):
                     kept.add(f"{path.relative_to(APP)}:{box.lineno}")
     assert len(found) > 10 and found == kept
+
+
+def test_a_command_that_finds_nothing_to_do_says_so_where_it_was_given(server: viser.ViserServer) -> None:
+    told: list[str] = []
+    client: Any = SimpleNamespace(add_notification=lambda _title, text, **_: told.append(text))
+
+    def act(given_by: Any) -> None:
+        if given_by is client:
+            raise HemislamError("There is no fork; fork first.")
+
+    add_command(server.gui, "Swap A and its fork B", act, hotkey="X")
+    (command,) = [c for c in server.gui._command_handle_from_uuid.values() if c.hotkey == "X"]
+    for callback in command._impl.trigger_cb:
+        callback(viser.CommandEvent(client=client, client_id=0, target=command))
+    assert told == ["There is no fork; fork first."]

@@ -15,7 +15,7 @@ from app.ui.colours import Rgb
 from app.ui.html import panel
 from app.ui.loops.words import BRIDGE, describe_edit, forecast, kind_of, what_happened, what_was_undone
 from app.ui.nodes import add_lines, clear, segments
-from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, as_set, by_user, show
+from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, add_command, as_set, by_user, show
 
 _REST_S: Final = 0.3
 _GHOST: Final[dict[bool, Rgb]] = {False: (255, 232, 70), True: (120, 90, 0)}
@@ -260,12 +260,9 @@ class EditsPanel:
         self._save = add_button(gui, "Save edits", self._download, viser.Icon.DOWNLOAD, hint=hint)
         load = gui.add_upload_button("Load edits…", icon=viser.Icon.UPLOAD, color="gray", mime_type=".yaml,.yml,text/*")
         load.on_upload(by_user(lambda file, _: self._load(file.content)))
-        gui.add_command("Undo the last edit of a loop", hotkey="Z", modifier="cmd/ctrl").on_trigger(
-            lambda _: send(UndoLoop())
-        )
-        gui.add_command("Redo the edit undone last", hotkey="Z", modifier="cmd/ctrl+shift").on_trigger(
-            lambda _: send(RedoLoop())
-        )
+        undo, redo = (lambda _: send(UndoLoop())), (lambda _: send(RedoLoop()))
+        add_command(gui, "Undo the last edit of a loop", undo, hotkey="Z", modifier="cmd/ctrl")
+        add_command(gui, "Redo the edit undone last", redo, hotkey="Z", modifier="cmd/ctrl+shift")
 
     def draw(self, snapshot: Snapshot) -> None:
         for button, verb, commands in (

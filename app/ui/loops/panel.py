@@ -9,6 +9,7 @@ import numpy as np
 import viser
 
 from app.server.protocol import InspectLoop, Seek, Snapshot
+from app.slam.errors import HemislamError
 from app.slam.loops.edits import Accept, LoopEdit, Reject, SetWeight, Solve
 from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.types import F64
@@ -21,7 +22,7 @@ from app.ui.loops.inspector import CLOSE, FLY, SEEK, Inspector
 from app.ui.loops.table import COLUMNS, Order, chips, listed, table
 from app.ui.loops.words import BRIDGE, KINDS, NEWER, OLDER, forecast, kind_of, largest_factors, name
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import ROOT, Changes, Page, View, add_button
+from app.ui.widgets import ROOT, Changes, Page, View, add_button, add_command
 
 _STEPS: Final = 14
 _STEP_S: Final = 0.03
@@ -88,8 +89,8 @@ class LoopsPanel:
                 panel("text", "What it would change is shown above, under “Before you decide”."), visible=False
             )
             self._factors = gui.add_html("")
-        gui.add_command("Next loop of the table", hotkey="J").on_trigger(lambda _: self._step(1))
-        gui.add_command("Previous loop of the table", hotkey="K").on_trigger(lambda _: self._step(-1))
+        add_command(gui, "Next loop of the table", lambda _: self._step(1), hotkey="J")
+        add_command(gui, "Previous loop of the table", lambda _: self._step(-1), hotkey="K")
 
     def seen(self, view: View) -> View:
         """The view, without the map and the scan while two submaps are shown alone."""
@@ -212,9 +213,10 @@ class LoopsPanel:
 
     def _step(self, by: int) -> None:
         rows = [edge.pair for edge in listed(self._page.snapshot().loops.edges, self._shown, self._order)]
-        if rows:
-            here = rows.index(self.chosen) if self.chosen in rows else (-1 if by > 0 else len(rows))
-            self.choose(rows[min(max(here + by, 0), len(rows) - 1)])
+        if not rows:
+            raise HemislamError("The table of loops is empty.")
+        here = rows.index(self.chosen) if self.chosen in rows else (-1 if by > 0 else len(rows))
+        self.choose(rows[min(max(here + by, 0), len(rows) - 1)])
 
     def _go(self, what: str, client: viser.ClientHandle) -> None:
         snapshot, pair = self._page.snapshot(), self.chosen
