@@ -46,6 +46,7 @@ const say = (text, x, y, colour, align = 'left') => {
 };
 const cleared = (canvas, pen) => { // with as many pixels as the screen has; its width and height in those of CSS
   const ratio = window.devicePixelRatio || 1, W = canvas.clientWidth, H = canvas.clientHeight;
+  if (!W) return []; // hidden: it stays as it is
   canvas.width = Math.round(W * ratio); canvas.height = Math.round(H * ratio);
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   return [W, H];
