@@ -1,7 +1,9 @@
 """What every panel needs: the page it is on, and helpers for viser's widgets."""
 
+import asyncio
 import time
 from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -111,6 +113,9 @@ class Page:
             notify_error(client, error)
 
 
+Callback = Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]
+_THREADS: Final = ThreadPoolExecutor(32, "page")
+"""Do what was asked for; viser has as many. Some wait for minutes, for a picture."""
 _NumberBox = TypeVar("_NumberBox", bound=viser.GuiNumberHandle[Any] | viser.GuiVector3Handle)
 _PLAIN: Final = (str, int, float, Enum, frozenset, View, Limits)
 
@@ -211,19 +216,26 @@ def notify_error(client: viser.ClientHandle, error: object) -> None:
     client.add_notification("Error", str(error), color="red", auto_close_seconds=None)
 
 
-def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callable[[viser.GuiEvent[Any]], None]:
-    """A callback that is called with the new value and the browser, and only when a person changed it.
+def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
+    """Calls `act` in a thread with the new value and the browser, and only when a person changed it.
 
     A HemislamError that it raises is shown in that browser. viser also calls back when code sets a value. Sending those
     on would make the page and the engine answer each other for ever.
+
+    viser calls a coroutine the moment it receives the value, but a plain function later, from a thread. By then another
+    value may be in the control, and would be taken for the one that was set.
     """
 
-    def callback(event: viser.GuiEvent[Any]) -> None:
+    def tried(value: Any, client: viser.ClientHandle) -> None:
+        try:
+            act(value, client)
+        except HemislamError as error:
+            notify_error(client, error)
+
+    async def callback(event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
-            try:
-                act(event.target.value, event.client)
-            except HemislamError as error:
-                notify_error(event.client, error)
+            loop = asyncio.get_running_loop()
+            await loop.run_in_executor(_THREADS, tried, event.target.value, event.client)
 
     return callback
 
@@ -260,13 +272,10 @@ def add_command(gui: viser.GuiApi, text: str, act: Callable[[viser.ClientHandle]
     gui.add_command(text, **key).on_trigger(given)
 
 
-def as_set(
-    act: Callable[[Any, viser.ClientHandle], None],
-) -> Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]:
-    """As `by_user`, for controls that code sets too. `act` must only note or enqueue: viser's event loop waits for it.
+def as_set(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
+    """As `by_user`, but before anything else happens: for controls that code sets too, and where `act` reads others.
 
-    viser calls a coroutine the moment it receives the value, but a plain function later, from a thread. By then a
-    snapshot's older value may be in the control, and that would be read.
+    It must only note or enqueue, since viser's event loop waits for it.
     """
 
     async def callback(event: viser.GuiEvent[Any]) -> None:

@@ -177,7 +177,7 @@ class Browser:
 
     def clicks(self, button: str) -> None:
         for callback in self.added[button]._impl.update_cb:
-            callback(viser.GuiEvent(client=self, client_id=0, target=self.added[button]))  # type: ignore[arg-type]
+            finish(callback(viser.GuiEvent(client=self, client_id=0, target=self.added[button])))  # type: ignore[arg-type]
 
 
 class BusyThreads:

@@ -30,7 +30,7 @@ from app.ui.compare_maths import (
 )
 from app.ui.nodes import PATH_COLOUR
 from app.ui.workbench import Workbench
-from tests.ui.conftest import Clock, Wire, user_clicks, user_sets
+from tests.ui.conftest import Clock, Wire, finish, user_clicks, user_sets
 from tests.ui.fake_engine import FakeEngine
 from tests.ui.fake_forks import DRIFT_M, TURN_DEG, workspace
 
@@ -124,7 +124,7 @@ def chooses(handle: object, value: str) -> Somebody:
     somebody = Somebody()
     handle._impl.value = value  # type: ignore[attr-defined]
     for callback in handle._impl.update_cb:  # type: ignore[attr-defined]
-        callback(viser.GuiEvent(client=somebody, client_id=0, target=handle))  # type: ignore[arg-type]
+        finish(callback(viser.GuiEvent(client=somebody, client_id=0, target=handle)))  # type: ignore[arg-type]
     return somebody
 
 

@@ -12,6 +12,7 @@ import pytest
 import viser
 
 from app.slam.errors import HemislamError
+from app.ui.viser_adapter import Bridge
 from app.ui.widgets import add_command, by_user, limited
 from tests.ui.conftest import BusyThreads, Wire, browser_sends
 
@@ -71,3 +72,14 @@ def test_a_command_that_finds_nothing_to_do_says_so_where_it_was_given(server: v
     for callback in command._impl.trigger_cb:
         callback(viser.CommandEvent(client=client, client_id=0, target=command))
     assert told == ["There is no fork; fork first."]
+
+
+def test_each_word_of_the_page_is_heard_once_however_late_the_threads_are(
+    server: viser.ViserServer, busy: BusyThreads
+) -> None:
+    heard: list[str] = []
+    bridge = Bridge(server.gui, "transport", lambda word, _: heard.append(word))
+    for sent in ("step 1 #1ab", "speed 2× #2cd"):
+        browser_sends(server, bridge._field, sent)
+    busy.catch_up()
+    assert heard == ["step 1", "speed 2×"]
