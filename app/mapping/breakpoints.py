@@ -138,10 +138,6 @@ class Breakpoints(_Fields):  # type: ignore[misc]  # its fields are those of the
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    def __getitem__(self, name: str) -> bool | float | None:
-        value: bool | float | None = getattr(self, name)
-        return value
-
     @property
     def chosen(self) -> dict[str, float]:
         """Those that are set; a switch has the number 1."""

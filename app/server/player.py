@@ -271,7 +271,7 @@ class Player:
     def _passed(self, session: Session, result: StepResult, *, played: bool) -> None:
         """Pause where a breakpoint holds, unless the frame is only passed by a seek."""
         before, self._moment = self._moment, CheckedFrame(result)
-        if self.breakpoints["error"] is not None and before is not None and session.frame > 0:
+        if "error" in self.breakpoints.chosen and before is not None and session.frame > 0:
             errors = session.errors()
             before, self._moment = replace(before, error=errors[-2]), replace(self._moment, error=errors[-1])
         if played and (why := reasons(self.breakpoints, before, self._moment)):

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import viser
 
-from app.server.keeping import KeepView
+from app.server.keeping import MOST_VIEWS, KeepView
 from app.server.protocol import Snapshot
 from app.slam.types import F64
 from app.ui.widgets import Changes, Page, add_button, add_command, by_user
@@ -246,7 +246,8 @@ class CameraPanel:
             "lens", tuple(_LENSES), hint="Orthographic: parallel lines stay parallel, and lengths can be compared."
         )
         lenses.on_click(by_user(self._choose_lens))
-        add_button(gui, "Keep this view", self._keep, viser.Icon.BOOKMARK)
+        hint = f"In the session, which holds the newest {MOST_VIEWS}."
+        add_button(gui, "Keep this view", self._keep, viser.Icon.BOOKMARK, hint=hint)
         self._list = gui.add_button_group(
             "kept views", ("1",), visible=False, hint="Go back to a view that was kept in this session."
         )

@@ -57,6 +57,11 @@ def result_folder_name(recording: Path, now: datetime) -> str:
     return f"{stem}-{now:%Y-%m-%d-%H%M%S}"
 
 
+def last_saved(snapshot: Snapshot) -> Path | None:
+    """The folder of the results that were saved last."""
+    return next((saved.folder for saved in reversed(snapshot.saved) if not saved.error), None)
+
+
 def folder_name(typed: str) -> str:
     """What was typed as the name of a folder for results. Raises HemislamError: it cannot be one."""
     name = typed.strip()
@@ -170,10 +175,9 @@ class FilesPanel:
     def draw(self, snapshot: Snapshot) -> None:
         self._save.disabled = snapshot.result is None
         self._compare.disabled = snapshot.recording is None or snapshot.live is not None
-        done = [saved.folder for saved in snapshot.saved if not saved.error]
-        self._saved.visible = self._download.visible = bool(done)
-        if done:
-            self._saved.content = panel("path", "Saved in ", str(done[-1]))
+        folder = last_saved(snapshot)
+        self._saved.visible = self._download.visible = folder is not None
+        self._saved.content = panel("path", "Saved in ", str(folder))
 
     def browse(self, client: viser.ClientHandle) -> None:
         def choose(path: Path) -> None:
@@ -210,8 +214,10 @@ class FilesPanel:
 
     def _offer(self, client: viser.ClientHandle) -> None:
         """Every file of the results that were saved last, each to be downloaded by a click."""
-        done = [saved.folder for saved in self._page.snapshot().saved if not saved.error]
-        files = sorted(path for path in done[-1].iterdir() if path.is_file()) if done and done[-1].is_dir() else []
+        folder = last_saved(self._page.snapshot())
+        if folder is None or not folder.is_dir():
+            raise HemislamError(f"The folder {folder} is gone; save the results again.")
+        files = sorted(path for path in folder.iterdir() if path.is_file())
         with dialog(client, "Download results"):
             for path in files:
                 text = f"{path.name}   {size_text(path.stat().st_size)}"

@@ -191,7 +191,7 @@ def test_an_engine_that_was_killed_still_pauses_there() -> None:
     engine = EngineProcess(Setup(recording=Path("dropped-30-12.mcap")), main=fakes.fake_main)
     try:
         engine.send(SetBreakpoints(Breakpoints(dropped=True)))
-        first = until(engine, lambda s: s.breakpoints["dropped"] and s.transport.frame == 0)
+        first = until(engine, lambda s: s.breakpoints.dropped and s.transport.frame == 0)
         assert engine.pid is not None
         os.kill(engine.pid, signal.SIGKILL)
         until(engine, lambda s: not s.engine_alive)

@@ -13,10 +13,11 @@ import viser
 from app.mapping.kept import Note
 from app.mapping.session_file import Opened, SavedSession, State, write_session
 from app.server.folders import Folders
-from app.server.protocol import Command, OpenedRecording, OpenRecording, Restart, Snapshot, Transport
+from app.server.protocol import Command, OpenedRecording, OpenRecording, Restart, Saved, Snapshot, Transport
+from app.slam.errors import HemislamError
 from app.slam.loops.edits import Reject
 from app.slam.params import Params
-from app.ui.files import RecentPanel
+from app.ui.files import FilesPanel, RecentPanel
 from tests.ui.conftest import page_of, user_clicks, user_sets
 
 STATE = State(Params(), edits=(Reject(3, 9), Reject(4, 9)), notes=(Note(4, "a door"),))
@@ -79,3 +80,13 @@ def test_an_engine_that_has_ended_for_good_is_started_again_by_a_button(server: 
     assert panel._restart.visible
     user_clicks(panel._restart)
     assert sent == [Restart()]
+
+
+def test_results_that_are_gone_are_not_offered_as_an_empty_list(server: viser.ViserServer, tmp_path: Path) -> None:
+    snapshot = replace(opened(tmp_path / "walk.mcap", 9), saved=(Saved(tmp_path / "gone"), Saved(tmp_path, "full")))
+    files = FilesPanel(page_of(server, snapshot=lambda: snapshot), Folders([tmp_path]), tmp_path)
+    files.add_buttons()
+    files.draw(snapshot)
+    assert files._download.visible and f"{tmp_path / 'gone'}" in files._saved.content
+    with pytest.raises(HemislamError, match="is gone; save the results again"):
+        files._offer(None)  # type: ignore[arg-type]
