@@ -52,6 +52,10 @@ AT_TEN_FRAMES_A_SECOND = """(() => {
   window.cancelAnimationFrame = (id) => pending.delete(id);
 })()"""
 """Limits the page's drawing. Software rendering without a limit would take a whole core from the tests."""
+SLIDERS = "[role=slider][aria-valuenow]"
+"""The sliders of parameters; those of the legend's colour bar are inputs of the browser's own."""
+ALPHA = 1
+"""Number of the slider of α: after that of M."""
 complaints: list[str] = []
 """Errors and warnings on the browser's consoles, and uncaught exceptions, since the last test."""
 

@@ -1,4 +1,4 @@
-"""Where a clock is set in mid-recording, time goes on, and the leap is told."""
+"""A clock that is set in the middle of a recording: the times go on without a jump, and a finding names the leap."""
 
 from collections.abc import Callable
 from pathlib import Path
