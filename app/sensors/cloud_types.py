@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from app.sensors.livox import CUSTOM_MSGS, CustomMsg
+from app.sensors.livox import CUSTOM_MSGS, DOUBTFUL, CustomMsg
 from app.sensors.ros import DATATYPES, stamp_fault, stamp_ns
 from app.slam.errors import printable
 from app.slam.types import F32, U8
@@ -23,6 +23,9 @@ FARTHEST_M = 10_000.0
 """On one axis; no LiDAR sees farther."""
 LATEST = 1e19
 """Of a point's time in any unit: years in ns. Beyond it integers overflow."""
+
+_LIVOX = {"tag", "line"}
+"""Fields of clouds of the Livox drivers, as `CustomMsg` and as PointCloud2."""
 
 
 class CloudError(ValueError):
@@ -64,7 +67,14 @@ class CloudMessage:
         return view.reshape(-1).astype(dtype.newbyteorder("="), copy=False)
 
     def xyz(self) -> F32:
-        """(n, 3) float32 m, as stored: NaN and zeros included."""
+        """(n, 3) float32 m, as stored: NaN and zeros included. Returns that a Livox doubts are zeros, too."""
+        points = self._stored_xyz()
+        if self.fields.keys() >= _LIVOX and (tag := self.column("tag")).dtype == np.uint8:
+            points[(tag & DOUBTFUL) != 0] = 0.0
+        return points
+
+    def _stored_xyz(self) -> F32:
+        """A copy."""
         offsets = [self.fields.get(name, (-1, np.dtype("V1"))) for name in "xyz"]
         first, dtype = offsets[0]
         if dtype == np.dtype("<f4") and len(self) and offsets == [(first + 4 * i, dtype) for i in range(3)]:

@@ -14,7 +14,7 @@ DRIVERS = ("livox_ros_driver2", "livox_ros_driver")
 CUSTOM_MSGS = tuple(f"{driver}/msg/CustomMsg" for driver in DRIVERS)
 _POINT = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 """Members of a point: ns after the first one, m, m, m. They are packed in ROS 1; CDR aligns each point to 4 bytes."""
-_DOUBTFUL = 0x20
+DOUBTFUL = 0x20
 """Bit of `tag` that marks a return of low confidence (Mid-360), or a second one (earlier units)."""
 _SURE = 0x10
 """`tag` of an ordinary return."""
@@ -52,7 +52,7 @@ class CustomMsg:
 
     Attributes:
         header: with the `stamp` that every message has. stated: `point_num`.
-        points: (n,) of `_POINT`, as many as there are. Doubtful returns are at zero, as where nothing came back.
+        points: (n,) of `_POINT`, as many as there are.
     """
 
     header: SimpleNamespace
@@ -86,12 +86,6 @@ class CustomMsg:
 
     @classmethod
     def _of(cls, seconds: int, nanoseconds: int, stated: int, points: npt.NDArray[Any]) -> "CustomMsg":
-        """Doubtful returns are put at zero."""
-        doubtful = (points["tag"] & _DOUBTFUL) != 0
-        if doubtful.any():
-            points = points.copy()
-            for axis in "xyz":
-                points[axis][doubtful] = 0.0
         return cls(SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds)), stated, points)
 
     @property
