@@ -142,6 +142,10 @@ class Sequencer:
             if stamp_ns == newest:
                 self.counts.imu_duplicates += 1
                 return
+            if len(self._stamps) > 1 and stamp_ns > self._stamps[-2] and not self._behind:  # neighbours change places
+                self._stamps.insert(-1, stamp_ns)
+                self._values.insert(-1, values)
+                return
             self.counts.imu_behind += 1
             if not self._behind:
                 back = (newest - stamp_ns) / 1e9

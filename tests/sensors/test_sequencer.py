@@ -257,6 +257,18 @@ def test_repeated_and_reversed_samples_are_left_out_and_reported_once() -> None:
     assert (sequencer.counts.imu_duplicates, sequencer.counts.imu_back_steps) == (1, 1)
 
 
+def test_neighbouring_samples_that_change_places_on_the_way_are_put_back() -> None:
+    sequencer, out, order = Sequencer(ImuParams()), [], samples(0, 510)
+    for n in range(5, 50, 5):
+        order[n : n + 2] = order[n + 1], order[n]
+    for at in range(0, 500, 100):
+        sequencer.add_scan(scan(at))
+    for at in order:
+        push(sequencer, at)
+        out += sequencer.ready(most_waiting=5)
+    assert [stamps(entry) for entry in out] == [samples(at, at + 100) for at in range(0, 500, 100)] and not told(out)
+
+
 @pytest.mark.parametrize("ahead_ms", [9_000_000, 900, 200])
 def test_one_sample_stamped_far_ahead_does_not_silence_the_rest(ahead_ms: int) -> None:
     sequencer = Sequencer(ImuParams())
@@ -286,17 +298,6 @@ def test_the_imu_goes_on_after_an_outage_of_many_seconds() -> None:
     assert stamps(out[1]) == [100, 110, *samples(5000, 5100)]
     assert len(out) == 4 and dropped(out) == []
     assert sequencer.counts.longest_imu_gap_s == 4.89
-
-
-def test_nan_samples_are_left_out_and_reported() -> None:
-    sequencer = Sequencer(ImuParams())
-    for at in samples(0, 110):
-        push(sequencer, at)
-        sequencer.add_imu(at * MS + MS, (float("nan"), 0, 0), (0, 0, 9.81))
-    sequencer.add_scan(scan(0))
-    (only,) = sequencer.ready()
-    assert stamps(only) == samples(0, 100)
-    assert sequencer.counts.imu_invalid == 12
 
 
 def test_repeated_and_reversed_scans_are_dropped_and_the_next_is_used() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from app.sensors.sequencer import Sequencer
 from app.slam.sections import ImuParams
 from app.slam.types import F64, Measurement
-from tests.sensors.test_sequencer import MS, samples, scan
+from tests.sensors.test_sequencer import MS, push, samples, scan, stamps
 
 
 def swaying(seed: int, count: int = 200) -> F64:
@@ -73,6 +73,17 @@ def test_a_shock_that_lasts_is_no_spike() -> None:
     values = swaying(1)
     values[100:104, 3] += [20.0, 60.0, 60.0, 20.0]
     assert given_on(values)[0] == list(range(198))
+
+
+def test_nan_samples_are_left_out_and_reported() -> None:
+    sequencer = Sequencer(ImuParams())
+    for at in samples(0, 110):
+        push(sequencer, at)
+        sequencer.add_imu(at * MS + MS, (float("nan"), 0, 0), (0, 0, 9.81))
+    sequencer.add_scan(scan(0))
+    (only,) = sequencer.ready()
+    assert stamps(only) == samples(0, 100)
+    assert sequencer.counts.imu_invalid == 12
 
 
 def test_a_refused_sample_is_reported_with_the_measurement() -> None:
