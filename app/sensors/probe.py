@@ -19,6 +19,11 @@ _CONTENT = {"lidar": "point clouds", "imu": "IMU samples"}
 PROBED_CLOUDS = 10
 PROBED_IMU_NS = 20_000_000_000
 
+PACKETS = {
+    "VelodyneScan", "PacketMsg", "RslidarPacket", "rslidarScan", "PandarScan", "UdpFrame", "UdpPacket", "NebulaPackets"
+}  # fmt: skip
+"""Names of message types that hold packets: of the Velodyne, Ouster, RoboSense and Hesai drivers, and of Nebula."""
+
 
 def usable_types(sensor: Literal["lidar", "imu"]) -> tuple[str, ...]:
     """Message types that hold measurements of this sensor."""
@@ -47,6 +52,12 @@ def choose_topic(source: Source, sensor: Literal["lidar", "imu"], wanted: str) -
     if not candidates:
         empty = [topic.name for topic in source.topics if topic.type in kinds]
         why = f"no messages on {empty[0]}" if empty else f"no topic of type {' or '.join(kinds)}"
+        packets = [topic.name for topic in source.topics if topic.type.rpartition("/")[2] in PACKETS and topic.messages]
+        if packets and sensor == "lidar":
+            raise HemislamError(
+                f"{source.path} holds no {content}, only packets as the sensor sends them ({', '.join(packets)}): run "
+                "its ROS driver on the recording, and record the PointCloud2 that the driver makes of them."
+            )
         raise HemislamError(f"{source.path} holds no {content}: {why}; it has {listed}.")
     if len(candidates) == 1:
         return candidates[0], Finding(subject, "fine", f"{candidates[0].name}, {candidates[0].messages} messages")

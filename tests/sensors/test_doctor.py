@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from app.sensors.doctor import examine
 from app.sensors.findings import Finding
@@ -170,6 +171,19 @@ def test_a_recording_without_clouds_is_reported_and_says_what_is_missing(tmp_pat
     assert findings[0].subject == "use" and findings[0].verdict == "needs you"
     assert "holds no point clouds" in findings[0].text
     assert "topics" in {finding.subject for finding in findings}
+
+
+def test_a_recording_of_packets_says_that_the_driver_must_make_clouds_of_them(tmp_path: Path) -> None:
+    kind = "rslidar_msg/msg/RslidarPacket"
+    rig.TYPESTORES[2].register(get_types_from_msg("std_msgs/Header header\nuint8[] data", kind))
+    packets = [
+        ("/rslidar_packets", at, rig.TYPESTORES[2].types[kind](header=rig.header(at, 2), data=np.zeros(1210, np.uint8)))
+        for at in range(rig.START_NS, rig.START_NS + 2 * rig.PERIOD_NS, rig.PERIOD_NS // 10)
+    ]
+    entries = [entry for entry in rig.walk(turns=20, columns=12) if entry[0] == "/imu"]
+    found = examine(rig.write(tmp_path / "walk", packets + entries), MOUNTED)[0]
+    assert found.subject == "use" and found.verdict == "needs you"
+    assert "only packets as the sensor sends them (/rslidar_packets): run its ROS driver" in found.text
 
 
 def test_a_recording_without_an_imu_is_reported_and_nothing_is_said_of_one(tmp_path: Path) -> None:
