@@ -188,6 +188,8 @@ def _certainty(pairs: Sequence[tuple[str, float, float]]) -> tuple[str, bool]:
     error = float(differences.std(ddof=1) / np.sqrt(len(pairs)))
     base, mean = float(np.mean([theirs for _, _, theirs in pairs])), abs(float(differences.mean()))
     may_be_chance = LIKE * base < mean < CHANCE * error
+    if base == 0:
+        return " (may be chance)" if may_be_chance else "", may_be_chance
     words = f" (± {100 * error / base:.1f} %, one standard error{': may be chance' if may_be_chance else ''})"
     return words, may_be_chance
 
@@ -196,7 +198,9 @@ def _compare(ours: float, theirs: float, like: float) -> tuple[str, bool]:
     """In words, and whether it got worse."""
     if abs(ours - theirs) <= like * max(abs(theirs), 1e-9):
         return _SAME, False
-    if ours > MANY * theirs > 0:
+    if theirs == 0:
+        return "rises from zero", True
+    if ours > MANY * theirs:
         return f"is {ours / theirs:.0f} times as large", True
     change = 100 * abs(ours - theirs) / theirs
     return (f"falls by {change:.0f} %", False) if ours < theirs else (f"rises by {change:.0f} %", True)

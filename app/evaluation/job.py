@@ -114,7 +114,7 @@ def read_run(folder: Path) -> dict[str, Any] | None:
 def all_or_nothing(job: Job) -> Iterator[Path]:
     """A folder for a run's files. At the end they are moved to their places, run.json last: a kill in between leaves
     no result."""
-    part = job.folder.with_name(f"{job.folder.name}.part-{os.getpid()}")
+    part = job.folder.with_name(f".{job.folder.name}.part-{os.getpid()}")  # no variant's name begins with a dot
     part.mkdir(parents=True, exist_ok=True)
     try:
         yield part
@@ -128,5 +128,5 @@ def all_or_nothing(job: Job) -> Iterator[Path]:
 
 def clear_remains(folder: Path) -> None:
     """Remove what runs that were killed left in the making."""
-    for part in folder.glob("*/*.part-*"):
+    for part in folder.glob("*/.*.part-*"):
         shutil.rmtree(part, ignore_errors=True)

@@ -87,6 +87,14 @@ def test_a_difference_that_all_recordings_share_is_not_chance() -> None:
     assert "(± 0.6 %, one standard error)" in text
 
 
+def test_an_error_of_zero_is_no_base_for_per_cent() -> None:
+    assert "rises from zero, 0 to 0.001 m" in about(said("indoor", [1.0], [0.0]), "error (ATE)")
+    assert "stays the same, 0 to 0 m" in about(said("indoor", [0.0], [0.0]), "error (ATE)")
+    shared = about(said("indoor", [1.0, 1.1, 0.9], [0.0] * 3), "error (ATE)")
+    assert "rises from zero, 0 to 0.001 m over 3 recordings; it rises on all" in shared
+    assert "over 3 recordings (may be chance)" in about(said("indoor", [1.0, 0.0, 0.0], [0.0] * 3), "error (ATE)")
+
+
 def walks(*variants: tuple[str, float, float]) -> list[Evaluated]:
     """Three recordings with the same results: names of variants, errors (mm) and CPU times (ms)."""
     outcomes = tuple(column(name, 1e-3 * error, cpu) for name, error, cpu in variants)
