@@ -20,7 +20,7 @@ def projected(name: str) -> "pyproj.CRS":
     """A coordinate system by "EPSG:code" or WKT.
 
     Raises:
-        HemislamError: there is none, or it is not a plane grid in metres, or has heights as well.
+        HemislamError: there is none, or it is no plane grid of eastings and northings in metres, or has heights.
     """
     crs = _system(name, "give one as EPSG:32632")
     if crs.is_compound:
@@ -30,6 +30,11 @@ def projected(name: str) -> "pyproj.CRS":
         raise HemislamError(f"{name} ({crs.name}) is not a plane grid; give a projected one such as EPSG:32632.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info):
         raise HemislamError(f"{name} ({crs.name}) is not in metres; give one that is.")
+    if any(axis.direction == "west" for axis in crs.axis_info):
+        raise HemislamError(
+            f"{name} ({crs.name}) counts towards the west; give a grid of eastings and northings, such as ESRI:102562"
+            " for EPSG:2048 or EPSG:5514 for EPSG:5513."
+        )
     return crs
 
 

@@ -38,12 +38,33 @@ def test_a_grid_of_the_other_side_of_the_earth_is_refused_and_the_right_one_name
         ("Mars", "names no"),
         ("EPSG:4326", "not a plane"),
         ("EPSG:2263", "not in metres"),
+        ("EPSG:2048", "counts towards the west"),
+        ("EPSG:5513", "counts towards the west"),
+        ("EPSG:2218", "counts towards the west"),
         ("EPSG:5555", "give EPSG:25832 and, as that of heights, EPSG:5783"),
     ],
 )
 def test_what_is_no_grid_in_metres_is_refused(name: str, words: str) -> None:
     with pytest.raises(HemislamError, match=words):
         crs.projected(name)
+
+
+@pytest.mark.parametrize("name", ["EPSG:31467", "EPSG:2193", "EPSG:5514", "ESRI:102562", "EPSG:3052", "EPSG:32661"])
+def test_a_grid_of_any_order_of_axes_has_its_first_axis_to_the_east_or_is_refused(name: str) -> None:
+    """Oracle: a step to the north, and one to the east, by pyproj's own geodesic."""
+    try:
+        area = crs.projected(name).area_of_use
+    except HemislamError:
+        assert "west" in {axis.direction for axis in pyproj.CRS(name).axis_info}
+        return
+    assert area is not None
+    longitude, latitude = (area.west + area.east) / 2, (area.south + area.north) / 2
+    geod, to_grid = pyproj.Geod(ellps="WGS84"), crs.transformer(crs.WGS84, name)
+    here = to_grid.transform(longitude, latitude)
+    for azimuth, (east, north) in ((90.0, (100.0, 0.0)), (0.0, (0.0, 100.0))):
+        there = to_grid.transform(*geod.fwd(longitude, latitude, azimuth, 100.0)[:2])
+        moved = there[0] - here[0], there[1] - here[1]
+        assert moved == pytest.approx((east, north), abs=20.0)
 
 
 def test_utm_is_narrower_than_the_ground_in_the_middle_of_a_zone_and_at_height() -> None:
