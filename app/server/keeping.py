@@ -12,7 +12,6 @@ MOST_NOTES: Final = 1000
 """Every page and every REST answer holds all of them."""
 MOST_VIEWS: Final = 6
 MOST_MEASURES: Final = 200
-"""Older ones are left out."""
 
 
 class KeptCommand(Command, frozen=True):
@@ -81,7 +80,7 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
     """The same after a command, given at a frame.
 
     Raises:
-        HemislamError: there are too many notes, another page has changed what is edited, or as `Clip`.
+        HemislamError: there are too many notes or measures, another page has changed what is edited, or as `Clip`.
     """
     notes, measures = kept.notes, kept.measures
     match command:
@@ -99,7 +98,11 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
         case KeepView(view):
             return replace(kept, views=(*kept.views, view)[-MOST_VIEWS:])
         case KeepMeasure(measure):
-            return replace(kept, measures=(*measures, measure)[-MOST_MEASURES:])
+            if len(measures) >= MOST_MEASURES:
+                raise HemislamError(
+                    f"A session holds at most {MOST_MEASURES} measures; this one was not added. Delete one first."
+                )
+            return replace(kept, measures=(*measures, measure))
         case RenameMeasure(measure, name):
             if measure not in measures:
                 raise HemislamError(f"Another page has changed that measure meanwhile; it was not renamed to “{name}”.")

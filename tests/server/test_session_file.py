@@ -37,7 +37,16 @@ from app.mapping.session_file import (
 )
 from app.sensors.presets import resolve_params
 from app.server.controller import Controller
-from app.server.keeping import MOST_NOTES, AddNote, DropMeasure, KeepMeasure, KeepView, RenameMeasure, SetClip
+from app.server.keeping import (
+    MOST_MEASURES,
+    MOST_NOTES,
+    AddNote,
+    DropMeasure,
+    KeepMeasure,
+    KeepView,
+    RenameMeasure,
+    SetClip,
+)
 from app.server.protocol import (
     Calibrated,
     OpenRecording,
@@ -252,6 +261,16 @@ def test_notes_are_kept_up_to_a_limit_and_what_is_beyond_it_is_reported(tmp_path
     seen = bench.see()
     assert [note.text for note in seen.notes] == [f"note {number}" for number in range(MOST_NOTES)]
     assert "A session holds at most 1,000 notes; this one was not added." in seen.notices[-1].text
+    bench.controller.close()
+
+
+def test_measures_are_kept_up_to_a_limit_and_what_is_beyond_it_is_reported(tmp_path: Path) -> None:
+    bench = Kept(tmp_path)
+    measures = [Measure(f"point {number}", (Spot(0, (0.0, 0.0, 0.0)),)) for number in range(MOST_MEASURES + 1)]
+    bench.do(*map(KeepMeasure, measures))
+    seen = bench.see()
+    assert seen.measures == tuple(measures[:-1])
+    assert "A session holds at most 200 measures; this one was not added." in seen.notices[-1].text
     bench.controller.close()
 
 
