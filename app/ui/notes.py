@@ -42,7 +42,7 @@ class NotesPanel:
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
         self._draw_pins(snapshot, view)
-        listed = list(enumerate(snapshot.notes))[-_SHOWN_NOTES:][::-1]
+        listed = [(_word(place, note), note) for place, note in enumerate(snapshot.notes)][-_SHOWN_NOTES:][::-1]
         self._list.content = self._bridge.live(panel("notes", listed)) if listed else ""
         self._list.visible = bool(snapshot.notes)
 
@@ -54,15 +54,15 @@ class NotesPanel:
             show(self._text, "")
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
-        """What the list sends: "go 812", "edit 3", "delete 3"."""
-        verb, _, text = word.partition(" ")
-        number, notes = int(text) if text.isdecimal() else -1, self._page.snapshot().notes
-        if verb == "go" and number >= 0:
-            self._page.send(Seek(number))
-        elif 0 <= number < len(notes) and verb == "delete":
-            self._page.send(EditNote(number, notes[number].text, ""))
-        elif 0 <= number < len(notes) and verb == "edit":
-            self._ask(number, notes[number].text, client)
+        """What the list sends: "go 812", "edit 3 91c5", "delete 3 91c5": the note as that browser shows it."""
+        verb, _, what = word.partition(" ")
+        if verb == "go" and what.isdecimal():
+            self._page.send(Seek(int(what)))
+        for place, note in enumerate(self._page.snapshot().notes):
+            if what == _word(place, note) and verb == "delete":
+                self._page.send(EditNote(place, note.text, ""))
+            elif what == _word(place, note) and verb == "edit":
+                self._ask(place, note.text, client)
 
     def _ask(self, place: int, before: str, client: viser.ClientHandle) -> None:
         def keep(text: str) -> None:
@@ -103,6 +103,11 @@ class NotesPanel:
         if (frame := self._pin_at(event)) is not None:
             self._page.send(Seek(frame))
         return frame is not None
+
+
+def _word(place: int, note: Note) -> str:
+    """Which note a click is for: a list that is not up to date has another one at this place."""
+    return f"{place} {hash(note):x}"
 
 
 def pins(notes: tuple[Note, ...], frames: int) -> list[tuple[int, str]]:

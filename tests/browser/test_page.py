@@ -7,7 +7,8 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from app.export.box import Box
-from app.server.keeping import KeepMeasure, SetClip
+from app.mapping.kept import Note
+from app.server.keeping import EditNote, KeepMeasure, SetClip
 from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, SetSpeed, StepFrame
 from app.ui.clip_maths import FACES, handle
 from tests.browser.conftest import ALPHA, SLIDERS, Bench, new_page
@@ -96,6 +97,26 @@ def test_a_focused_slider_takes_the_arrow_for_itself_and_the_scene_is_relabelled
     assert not [command for command in bench.engine.sent if isinstance(command, StepFrame)]
     bench.engine.send(SetParams({"ground.alpha": 40.0, "ground.scan_lines": 8}))
     expect(slider).to_have_attribute("aria-valuenow", "40")
+
+
+def test_a_double_click_on_delete_deletes_one_note(bench: Bench) -> None:
+    """The list is drawn again between its two clicks, with the next note where the first one was."""
+    notes = tuple(Note(1, f"remark {number}") for number in range(4))
+    bench.engine.publish(notes=notes)
+    bench.page.get_by_role("tab", name="Recording").click()
+    button = bench.page.get_by_role("button", name="Delete note").first
+    button.click()
+    bench.eventually(lambda: bench.engine.sent == [EditNote(3, "remark 3", "")], 8)
+    bench.engine.publish(notes=notes[:3])
+    expect(bench.page.get_by_role("button", name="Delete note")).to_have_count(3)
+    bench.page.mouse.down(click_count=2)
+    bench.page.mouse.up(click_count=2)
+    bench.page.wait_for_timeout(500)
+    assert len(bench.engine.sent) == 1
+    button.click()
+    bench.eventually(lambda: bench.engine.sent[1:] == [EditNote(2, "remark 2", "")])
+    bench.engine.publish(notes=())
+    bench.page.get_by_role("tab", name="Parameters").click()
 
 
 def test_two_drags_of_a_slider_are_two_steps_of_undo(bench: Bench) -> None:

@@ -30,6 +30,7 @@ if (!window.hemislamSay) {
     const element = event.target.closest && event.target.closest('[data-hs]');
     if (!element || (event.type === 'keydown' && (event.key !== 'Enter' || element.tagName === 'BUTTON'))) return;
     const name = element.closest('[data-hs-to]').dataset.hsTo, word = element.dataset.hs;
+    if (event.detail > 1 && /^(delete|drop) /.test(word)) return; // of a double click, the second one meets the next line
     waiting.set(name + ' ' + word.split(' ')[0], [name, word]);
     if (!sending) send();
   };
