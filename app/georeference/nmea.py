@@ -24,6 +24,7 @@ class _Log:
         places: latitude and longitude in degrees, height above the geoid and the geoid's above the ellipsoid (nan if
             not told), m. stamps, at: of each place, in ns and in s of the day.
         sigmas: m to the east, north and up by s of the day.
+        fixed: the last GGA or RMC has a fix. Without one, the date of ZDA may be that of the receiver's own clock.
     """
 
     near_ns: int
@@ -31,6 +32,7 @@ class _Log:
     stamps: list[int] = field(default_factory=list)
     at: list[float] = field(default_factory=list)
     sigmas: dict[float, tuple[float, float, float]] = field(default_factory=dict)
+    fixed: bool = True
 
     def add(self, line: str) -> None:
         """One line; anything but a whole sentence with the right checksum is ignored."""
@@ -39,14 +41,18 @@ class _Log:
             return
         kind, *words = body.split(",")
         try:
-            if kind.endswith("GGA") and len(words) > 10 and int(words[5] or 0) > 0:
-                self._place(words)
+            if kind.endswith("GGA") and len(words) > 10:
+                self.fixed = int(words[5] or 0) > 0
+                if self.fixed:
+                    self._place(words)
             elif kind.endswith("GST") and len(words) > 7 and words[5]:
                 north, east, up = (float(word) for word in words[5:8])
                 self.sigmas[_seconds(words[0])] = east, north, up
-            elif kind.endswith("RMC") and len(words) > 8 and words[1] == "A" and words[8]:
-                self._day(datetime.strptime(words[8], "%d%m%y"), words[0])
-            elif kind.endswith("ZDA") and len(words) > 3 and words[3]:
+            elif kind.endswith("RMC") and len(words) > 8:
+                self.fixed = words[1] == "A"
+                if self.fixed and words[8]:
+                    self._day(datetime.strptime(words[8], "%d%m%y"), words[0])
+            elif kind.endswith("ZDA") and len(words) > 3 and words[3] and self.fixed:
                 self._day(datetime.strptime("".join(words[1:4]), "%d%m%Y"), words[0])
         except ValueError:
             return

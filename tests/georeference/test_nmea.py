@@ -36,12 +36,29 @@ def test_the_date_of_a_receiver_without_a_fix_does_not_count() -> None:
     assert (fixes.stamps_ns == 764_426_119 * 10**9).all()
 
 
-def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
-    gst = "$GPGST,123519,0.006,0.023,0.020,273.6,0.023,0.020,0.031*"
+def sentence(body: str) -> str:
+    """With its checksum."""
     value = 0
-    for character in gst[1:-1].encode():
+    for character in body.encode():
         value ^= character
-    fixes, _ = nmea.read([GGA, f"{gst}{value:02X}"], "log", 0)
+    return f"${body}*{value:02X}"
+
+
+@pytest.mark.parametrize("void", ["GPRMC,000010.00,V,,,,,,,060180,,,N", "GPGGA,000010.00,,,,,0,00,99.99,,,,,,"])
+def test_a_date_of_zda_counts_only_while_there_is_a_fix(void: str) -> None:
+    cold, warm = sentence("GPZDA,000010.00,06,01,1980,00,00"), sentence("GPZDA,123519.00,23,03,1994,00,00")
+    day_before = (764_426_119 - DAY_S) * 10**9
+    for lines, near_ns in (
+        ([sentence(void), cold, GGA], 764_426_000 * 10**9),
+        ([GGA, warm, sentence(void), cold], day_before),
+        ([warm, GGA], day_before),
+    ):
+        fixes, _ = nmea.read(lines, "log", near_ns)
+        assert (fixes.stamps_ns == 764_426_119 * 10**9).all()
+
+
+def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
+    fixes, _ = nmea.read([GGA, sentence("GPGST,123519,0.006,0.023,0.020,273.6,0.023,0.020,0.031")], "log", 0)
     assert fixes.sigmas[0].tolist() == [0.020, 0.023, 0.031]  # GST names north first
 
 
