@@ -35,7 +35,7 @@ from pydantic import (
 from app import __version__
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.kept import Kept
+from app.mapping.kept import Clip, Kept
 from app.mapping.labels import LabelEdit
 from app.mapping.painted import marks, read_json
 from app.slam.errors import HemislamError
@@ -125,13 +125,14 @@ class State(Kept):
     calibration: str = ""
 
 
-_OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)
+_OPENED, _STATE, _CLIP = TypeAdapter(Opened), TypeAdapter(State), TypeAdapter(Clip)
 
 
 @dataclass(frozen=True, slots=True)
 class SavedSession:
     """What a session file holds. frame: where it is, -1 before the first. ended: the recording had ended, so that loops
     were searched at the last keyframes too. known: the last frame that holds, `frame` or one that it went back from.
+    left_out: what of the file could not be read, in a sentence; "" if all could.
     """
 
     opened: Opened
@@ -139,6 +140,7 @@ class SavedSession:
     frame: int
     ended: bool = False
     known: int = -1
+    left_out: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "known", max(self.frame, self.known))
@@ -252,16 +254,12 @@ def read_session(path: Path) -> SavedSession:
     try:
         opened = _OPENED.validate_python(head)
         states = [entry for entry in entries if "state" in entry]
-        state = _STATE.validate_python(states[-1]["state"]) if states else State(Params())
+        state, left_out = _state_of(states[-1]["state"]) if states else (State(Params()), "")
         place: dict[str, Any] = next((entry for entry in reversed(entries) if "frame" in entry), {})
         frame, ended, known = int(place.get("frame", -1)), bool(place.get("ended")), int(place.get("known", -1))
     except (HemislamError, AttributeError, KeyError, TypeError, ValueError, OverflowError, zlib.error) as error:
-        why = repr(error)
-        if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise HemislamError(
-            f"The session {path} is damaged ({why[:200]}); use an older copy, if you have one."
+            f"The session {path} is damaged ({_why(error)}); use an older copy, if you have one."
         ) from None
     if not states:
         raise HemislamError(f"The session {path} ends before its first frame; open its recording {opened.recording}.")
@@ -272,7 +270,24 @@ def read_session(path: Path) -> SavedSession:
     if not same:
         gone = "is a different file now" if opened.recording.exists() else "is missing"
         raise HemislamError(f"The recording {opened.recording} of the session {path} {gone}; put it back there.")
-    return SavedSession(opened, state, frame, ended, known)
+    return SavedSession(opened, state, frame, ended, known, left_out)
+
+
+def _state_of(entry: Mapping[str, Any]) -> tuple[State, str]:
+    """The state in a line, and what was left out of it, as in `SavedSession`: what is shown decides no result."""
+    try:
+        _CLIP.validate_python(entry.get("clip", {}))
+    except (HemislamError, ValidationError) as error:
+        rest = {name: value for name, value in entry.items() if name != "clip"}
+        return _STATE.validate_python(rest), f"The session's clip box and slab were left out ({_why(error)})."
+    return _STATE.validate_python(entry), ""
+
+
+def _why(error: Exception) -> str:
+    if not isinstance(error, ValidationError):
+        return repr(error)[:200]
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:200]
 
 
 def read_marks(path: Path) -> tuple[tuple[int, bytes], ...]:

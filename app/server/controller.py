@@ -328,6 +328,8 @@ class Controller:
         self._take(session, saved)
         self._set_breakpoints(state.breakpoints)
         self._player.set_speed(state.speed)
+        if saved.left_out:
+            self._page.notice("warning", saved.left_out)
         if gone:
             self._page.notice("warning", f"The session was compared with {state.truth}, which no longer exists.")
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,6 +126,42 @@ def test_a_file_that_is_no_session_is_refused_in_a_sentence(tmp_path: Path, cont
     path.write_bytes(content)
     with pytest.raises(HemislamError, match=says):
         read_session(path)
+
+
+@pytest.mark.parametrize(
+    "clip",
+    [
+        {"slab": 0.0},
+        {"slab": "wide"},
+        {"on": True, "box": {"low": [0, 0, 0], "high": [0, 1, 1]}},
+        {"box": {"low": [0, 0, 0], "high": [1, 1, 1], "turn": 999}},
+        7,
+    ],
+)
+def test_a_clip_that_cannot_be_is_left_out_with_a_sentence(saved: SavedSession, tmp_path: Path, clip: Any) -> None:
+    path = tmp_path / "a.hemislam"
+    write_session(path, saved)
+    head, entry = map(json.loads, path.read_text().splitlines())
+    entry["state"]["clip"] = clip
+    path.write_text(f"{json.dumps(head)}\n{json.dumps(entry)}\n")
+    read = read_session(path)
+    assert "clip box and slab were left out (" in read.left_out
+    assert replace(read, left_out="") == saved
+
+
+def test_a_session_whose_clip_cannot_be_opens_in_the_page_and_says_so(tmp_path: Path) -> None:
+    bench = Kept(tmp_path)
+    bench.do(StepFrame())
+    path = bench.session_file
+    bench.controller.close()
+    text = path.read_text()
+    assert '"slab": 1.0' in text
+    path.write_text(text.replace('"slab": 1.0', '"slab": 0.0'))
+    again = Kept(tmp_path)
+    again.do(OpenRecording(path))
+    seen = again.see()
+    assert seen.recording is not None and any("were left out" in notice.text for notice in seen.notices)
+    again.controller.close()
 
 
 def test_a_recording_that_is_gone_or_another_is_said(saved: SavedSession, tmp_path: Path) -> None:
