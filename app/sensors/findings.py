@@ -28,6 +28,14 @@ class Finding:
         return f"{self.text} {use}" if self.option else self.text
 
     @property
+    def spoken(self) -> str:
+        """Text and option, for readers of the page too, who have no command line before them."""
+        if not self.option:
+            return self.text
+        settle = f"start hemislam with {self.option}"
+        return f"{self.text}; {settle}" if self.verdict == "needs you" else f"{self.text} (if that is wrong, {settle})"
+
+    @property
     def sentence(self) -> str:
         """For a notification on the page, which has the options under Recording."""
         said = f"{self.subject[:1].upper()}{self.subject[1:]}: {self.text.rstrip('.')}."

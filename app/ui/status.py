@@ -80,12 +80,12 @@ def settled(params: Params, option: str) -> Params | None:
 
 def findings_html(findings: tuple[Finding, ...], params: Params) -> str:
     """The findings, those that need the user first, with a button for what would change something; the rest folded."""
-    rows: dict[str, list[tuple[Finding, str, str, str]]] = {verdict: [] for verdict in reversed(_LOOKS)}
+    rows: dict[str, list[tuple[Finding, str, str, str, bool]]] = {verdict: [] for verdict in reversed(_LOOKS)}
     for finding in findings:
         needed = finding.verdict == "needs you"
         after = settled(params, finding.option) if finding.verdict != "fine" else None
         change = "" if after in (None, params) else "Settle it" if needed else "Use this instead"
-        rows[finding.verdict].append((finding, *_LOOKS[finding.verdict], change))
+        rows[finding.verdict].append((finding, *_LOOKS[finding.verdict], change, needed and after is None))
     fine = rows.pop("fine")
     return panel("findings", [row for unsettled in rows.values() for row in unsettled], fine)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
 from app.sensors.presets import PRESETS
 from app.server.protocol import (
@@ -63,6 +64,14 @@ def test_a_finding_is_settled_by_a_button_where_its_option_changes_a_parameter()
         assert settled(Params(), beyond) is None
     assert findings_html(FINDINGS, Params()).count("settle --set imu.max_gap=0.4") == 1
     assert gap is not None and "settle --set imu" not in findings_html(FINDINGS, gap)
+
+
+def test_a_finding_that_no_button_settles_says_where_its_option_belongs() -> None:
+    topic = Finding("IMU values", "needs you", "the IMU is stuck", "--imu-topic if there is another IMU")
+    shown = findings_html((topic,), Params())
+    assert "Start hemislam with</span><code>--imu-topic if there is another IMU</code>" in shown
+    assert topic.spoken == "the IMU is stuck; start hemislam with --imu-topic if there is another IMU"
+    assert "Start hemislam with" not in findings_html(FINDINGS, Params())
 
 
 def test_every_tile_is_explained_in_a_sentence() -> None:

@@ -343,7 +343,7 @@ class Intake:
     def _tell_findings(self, kind: Kind, sensor: Literal["LiDAR", "IMU"], findings: list[Finding]) -> None:
         for finding in findings:
             if finding.verdict != "fine":
-                self._tell(kind, sensor, f"{finding.subject}: {finding}")
+                self._tell(kind, sensor, f"{finding.subject}: {finding.spoken}")
 
     def _bound(self) -> None:
         while len(self._scans) > MAX_BACKLOG:
