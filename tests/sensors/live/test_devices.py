@@ -18,6 +18,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from app.sensors.cloud_types import read_custom_msg
 from app.sensors.live import livox_udp
 from app.sensors.live.decoder import Decoder
 from app.sensors.live.devices import DEVICES, device_of
@@ -140,7 +141,7 @@ def test_a_mid360s_points_are_metres_at_even_times(kind: int, layout: str, unit:
     assembler.add(packet, 0)
     (frame,) = assembler.flush()
     message = livox_udp.read_points(frame.packets)
-    points = np.column_stack([message.points[axis] for axis in "xyz"])
+    points = read_custom_msg(message).xyz()
     np.testing.assert_allclose(points[[0, 3]], np.array(places)[[0, 3]], rtol=1e-6)
     assert not points[[1, 2]].any()  # nothing came back; a doubtful return
     assert message.points["offset_time"].tolist() == [0, 5_000, 10_000, 15_000]
