@@ -145,6 +145,8 @@ class Sequencer:
             if len(self._stamps) > 1 and stamp_ns > self._stamps[-2] and not self._behind:  # neighbours change places
                 self._stamps.insert(-1, stamp_ns)
                 self._values.insert(-1, values)
+                if len(self._values) > 2:
+                    self._check(-3, -2, -1)
                 return
             self.counts.imu_behind += 1
             if not self._behind:

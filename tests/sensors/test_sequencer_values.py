@@ -69,6 +69,18 @@ def test_one_bad_sample_is_left_out_wherever_it_is_and_no_other(
     assert place not in kept
 
 
+def test_a_bad_sample_is_left_out_also_where_it_arrives_after_the_next() -> None:
+    values, sequencer = swaying(5, 60), Sequencer(ImuParams())
+    values[30, 4] += 60.0
+    for n in (*range(30), 31, 30, *range(32, 60)):
+        sequencer.add_imu(n * 10 * MS, tuple(values[n, :3]), tuple(values[n, 3:]))
+    sequencer.add_scan(scan(10, 560))
+    (only,) = sequencer.ready()
+    assert isinstance(only, Measurement)
+    assert (only.imu.stamps_ns // MS).tolist() == [at for at in samples(0, 570) if at != 300]
+    assert sequencer.counts.imu_spikes == 1
+
+
 def test_a_shock_that_lasts_is_no_spike() -> None:
     values = swaying(1)
     values[100:104, 3] += [20.0, 60.0, 60.0, 20.0]
