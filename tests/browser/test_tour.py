@@ -60,6 +60,7 @@ def test_a_word_of_the_page_does_not_take_the_place_of_what_a_slider_was_set_to(
             await new Promise((then) => setTimeout(then, 5));
           }
           hemislamSay({type: 'click', target: document.querySelector('.hs-released')});
+          for (const busy = performance.now(); performance.now() < busy + 200;); // viser's timer and ours are both late
         }"""
     )
     bench.eventually(lambda: said.value != before)
