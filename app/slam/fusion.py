@@ -69,9 +69,9 @@ def _with_imu(prediction: Prediction, sampled: F32, local_map: LocalMap, params:
     change = float(np.linalg.norm(predicted.state.v_odom_imu - begin.v_odom_imu))
     correction = float(np.linalg.norm(posterior.state.v_odom_imu - predicted.state.v_odom_imu))
     registration = replace(registration, predicted_change=change, correction=correction)
-    if registration.surprise > iekf.SURPRISING:  # once more, as if nothing were known of the speed
-        open_speed = imu.with_open_speed(predicted, (predicted.state.stamp_ns - begin.stamp_ns) * 1e-9)
-        again, of_it = _attempted(predicted, partial(iekf.update, open_speed, chosen, local_map, params.filter))
+    if registration.surprise > iekf.SURPRISING:  # once more, from a prediction that is less sure
+        opened = imu.with_open_motion(predicted, registration.surprise)
+        again, of_it = _attempted(predicted, partial(iekf.update, opened, chosen, local_map, params.filter))
         posterior = again if of_it.inliers >= iekf.MIN_INLIERS else posterior
     return posterior, registration
 

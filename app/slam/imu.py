@@ -17,7 +17,7 @@ ROT, POS, VEL, BG, BA, GRAV, EXT_ROT, EXT_POS = (
 )  # fmt: skip
 """Order of the 23 error dimensions: rotation (IMU frame), position, velocity (odom), gyro bias, accel
 bias, gravity (2, tangent of S²), extrinsic rotation (LiDAR frame), extrinsic translation (IMU frame)."""
-POSE, EXT = slice(0, 6), slice(17, 23)
+POSE, MOTION, EXT = slice(0, 6), slice(0, 9), slice(17, 23)
 
 MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""
@@ -174,12 +174,15 @@ def after_gap(belief: Belief, before: Belief) -> Belief:
     return Belief(replace(belief.state, b_gyro=before.state.b_gyro), covariance)
 
 
-def with_open_speed(belief: Belief, seconds: float) -> Belief:
-    """The belief if nothing was known of the speed so long ago."""
-    covariance = belief.covariance.copy()
-    for a, b, factor in ((VEL, VEL, 1.0), (POS, VEL, seconds), (VEL, POS, seconds), (POS, POS, seconds**2)):
-        covariance[a, b] += factor * WALKING**2 * np.eye(3)
-    return replace(belief, covariance=covariance)
+def with_open_motion(belief: Belief, surprise: float) -> Belief:
+    """The belief with a covariance of pose and speed as large as the scan's `surprise` (see `Registration`) says.
+
+    Every direction opens in proportion to what is not known of it. One that the scan leaves open therefore stays if it
+    was known a moment ago, and moves if it has been unknown for long.
+    """
+    opened = np.ones(DIM)
+    opened[MOTION] = np.sqrt(surprise)
+    return replace(belief, covariance=belief.covariance * np.outer(opened, opened))
 
 
 def with_open_biases(belief: Belief) -> Belief:
