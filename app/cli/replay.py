@@ -57,7 +57,7 @@ def repeat(path: Path, *, to_end: bool = False) -> "Iterator[tuple[Session, Base
 
     saved = read_session(path)
     if saved.left_out:
-        typer.echo(saved.left_out)
+        typer.echo(f"hemislam: {saved.left_out}", err=True)
     opened, truth = saved.opened, saved.state.truth
     if truth is not None and not truth.exists():  # no result but its errors follows from it
         typer.echo(f"The session was compared with {truth}, which no longer exists.")

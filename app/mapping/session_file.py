@@ -155,7 +155,8 @@ class SavedSession:
         history = tuple(entry for entry in self.state.history if entry[0] <= frame)
         notes = tuple(note for note in self.state.notes if note.frame <= frame)
         state = replace(self.state, params=params, history=history, notes=notes)
-        return SavedSession(self.opened, state, frame, ended=self.ended and frame == self.frame)
+        ended = self.ended and frame == self.frame
+        return SavedSession(self.opened, state, frame, ended, left_out=self.left_out)
 
 
 class SessionWriter:
@@ -284,6 +285,8 @@ def _state_of(entry: Mapping[str, Any]) -> tuple[State, str]:
 
 
 def _why(error: Exception) -> str:
+    if isinstance(error, HemislamError):
+        return str(error)[:200].rstrip(".")
     if not isinstance(error, ValidationError):
         return repr(error)[:200]
     first = error.errors()[0]

@@ -157,7 +157,8 @@ class Workspace:
             write_session(file, session)
             self._begin(file, session, name, folder, session.frame)
             changed = ", ".join(f"{path} = {value}" for path, value in (values or {}).items())
-            a.engine.send(AddNote(f"Forked as {self.names[1]}{f' with {changed}' if changed else ''}."))
+            note = f"Forked as {self.names[1]}{f' with {changed}' if changed else ''}."
+            a.engine.send(AddNote(f"{note} {session.left_out}"))
 
     def open(self, path: Path) -> None:
         """Start B on a session file of A's recording. Raises HemislamError: it is of another one, or B exists."""
@@ -169,7 +170,7 @@ class Workspace:
             if ours is None or (ours.recording, ours.start_s) != (theirs.recording, theirs.start_s):
                 raise HemislamError(f"{path.name} is of {theirs.recording} from {theirs.start_s:g} s; open that first.")
             self._begin(path, session, path.stem, folder, 0)
-            a.engine.send(AddNote(f"Opened {path.name} beside this session."))
+            a.engine.send(AddNote(f"Opened {path.name} beside this session. {session.left_out}"))
 
     def kept(self) -> list[Path]:
         """Session files of A's recording that B can be opened on, the newest first."""

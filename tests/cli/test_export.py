@@ -53,6 +53,15 @@ def test_a_session_gives_the_points_of_a_run_to_its_frame(hemislam: Call, walk: 
     assert len(of_run) > 1000
 
 
+def test_a_session_whose_clip_cannot_be_is_exported_with_a_sentence(hemislam: Call, walk: Path, tmp_path: Path) -> None:
+    session, params = tmp_path / "walk.hemislam", resolve_params(walk, None, None, [])
+    write_session(session, SavedSession(Opened(walk, nbytes=size_of(walk)), State(params), 2))
+    session.write_text(session.read_text().replace('"slab": 1.0', '"slab": 0.0'))
+    outcome = hemislam("export", session, "--format", "tum", "--out", tmp_path / "out")
+    assert outcome.code == 0 and "clip box and slab were left out (" in outcome.err, outcome.err
+    assert (tmp_path / "out" / "trajectory.tum").is_file()
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

@@ -129,6 +129,22 @@ def test_a_command_that_a_dying_b_lost_is_sent_again(tmp_path: Path) -> None:
     workspace.close()
 
 
+def test_a_fork_tells_what_was_left_out_of_a_session_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.hemislam"
+    writer = SessionWriter(path, Opened(tmp_path / "walk.mcap"))
+    writer.write(5, State(Params()))
+    writer.close()
+    path.write_text(path.read_text().replace('"slab": 1.0', '"slab": 0.0'))
+    (tmp_path / "walk.mcap").touch()
+    for begin in (lambda workspace: workspace.fork("b"), lambda workspace: workspace.open(path)):
+        a = Recorder(replace(at(5), session_file=path))
+        workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: Recorder(at(5)))
+        begin(workspace)
+        (note,) = (command.text for command in a.sent if isinstance(command, AddNote))
+        assert "clip box and slab were left out (" in note
+        workspace.close()
+
+
 def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
     first, later, latest = (Params().with_values({"ground.alpha": alpha}) for alpha in (30.0, 40.0, 50.0))
     writer = SessionWriter(tmp_path / "a.hemislam", Opened(tmp_path / "none.mcap"))
