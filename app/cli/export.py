@@ -110,9 +110,14 @@ def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]
         results = session.results()
         mark(results, read_session(source).state)
         results = georeference_if_possible(results, session.survey, session.edits.done)
-        results.where = results.where or reference.read(source.parent)
+        folder = out or free_folder(source)
+        if results.where is None:
+            results.where, problem = reference.read_if_possible(source.parent)
+            if problem and folder.resolve() == source.parent.resolve():
+                raise HemislamError(f"{problem} Choose another folder as --out, so that the file stays.")
+            results.problem = results.problem or problem
         results.choice = choice
-        _save(results, out or free_folder(source), exports)
+        _save(results, folder, exports)
 
 
 def _save(results: "Results", folder: Path, exports: "tuple[Export, ...]") -> None:
@@ -121,6 +126,8 @@ def _save(results: "Results", folder: Path, exports: "tuple[Export, ...]") -> No
     with progress_bar("Exporting") as show:
         results.progress = show
         save_results(folder, results, exports, replace=True)
+    if results.where is None and results.problem:
+        typer.echo(f"hemislam: {results.problem}", err=True)
     for one in exports:
         if (folder / one.name).exists():
             typer.echo(f"{folder / one.name}: {(folder / one.name).stat().st_size / 1e6:.1f} MB")

@@ -20,6 +20,8 @@ from app.slam.trajectory import read_tum
 def read_results(folder: Path) -> Results:
     """What exports are made from. The trajectory is that of the map, loops included.
 
+    A georeference that cannot be used is left out, and `Results.problem` says why.
+
     Raises:
         HemislamError: the folder does not hold the map and the trajectory of a run, or they cannot be read.
     """
@@ -36,7 +38,8 @@ def read_results(folder: Path) -> Results:
         g2o = None
     loops = LoopResults(MapFrame(), np.empty(0, np.int64), (), g2o) if g2o is not None else None
     info = RunInfo(recording_of(folder) or folder, Params())
-    return Results(log, MapFile(folder / "map.ply"), info, loops, where=reference.read(folder))
+    where, problem = reference.read_if_possible(folder)
+    return Results(log, MapFile(folder / "map.ply"), info, loops, where=where, problem=problem)
 
 
 def recording_of(folder: Path) -> Path | None:

@@ -99,3 +99,11 @@ def read(folder: Path) -> GeoReference | None:
         return None
     except OSError as error:
         raise HemislamError(f"{folder / FILE} cannot be read: {error.strerror}.") from None
+
+
+def read_if_possible(folder: Path) -> tuple[GeoReference | None, str]:
+    """As `read`; where that fails, None and the reason, in a sentence."""
+    try:
+        return read(folder), ""
+    except HemislamError as error:
+        return None, f"The georeference of {folder / FILE} is not used: {error}"

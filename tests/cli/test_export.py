@@ -1,6 +1,7 @@
 """`hemislam export` from the outside: from results and from a session to the same points."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,26 @@ def test_a_session_whose_clip_cannot_be_is_exported_with_a_sentence(hemislam: Ca
     outcome = hemislam("export", session, "--format", "tum", "--out", tmp_path / "out")
     assert outcome.code == 0 and "clip box and slab were left out (" in outcome.err, outcome.err
     assert (tmp_path / "out" / "trajectory.tum").is_file()
+
+
+def test_a_grid_that_cannot_be_used_costs_only_the_georeference(results: Path, hemislam: Call, tmp_path: Path) -> None:
+    """Earlier versions took grids that count towards the west."""
+    folder = tmp_path / "results"
+    shutil.copytree(results, folder)
+    file = folder / "georeference.json"
+    file.write_text('{"crs": "EPSG:2048", "origin": [1.0, 2.0, 3.0]}')
+    params = resolve_params(results, None, None, [])
+    walk = Path(json.loads((results / "report.json").read_text())["recording"]["path"])
+    session = SavedSession(Opened(walk, nbytes=size_of(walk)), State(params), 2)
+    write_session(folder / "session.hemislam", session)
+    for source in (folder, folder / "session.hemislam"):
+        outcome = hemislam("export", source, "--format", "tum", "--out", tmp_path / "out")
+        assert outcome.code == 0 and "georeference.json" in outcome.err and "towards the west" in outcome.err, outcome
+        refused = hemislam("export", source, "--format", "gpx")
+        assert refused.code == 2 and "towards the west" in refused.err
+    refused = hemislam("export", folder / "session.hemislam", "--format", "tum", "--out", folder)
+    assert refused.code == 2 and "Choose another folder" in refused.err
+    assert hemislam("export", folder, "--format", "tum", "--out", folder / "export").code == 0 and file.exists()
 
 
 @pytest.mark.parametrize(
