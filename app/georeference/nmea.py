@@ -24,7 +24,9 @@ class _Log:
         places: latitude and longitude in degrees, height above the geoid and the geoid's above the ellipsoid (nan if
             not told), m. stamps, at: of each place, in ns and in s of the day.
         sigmas: m to the east, north and up by s of the day.
-        fixed: the last GGA or RMC has a fix. Without one, the date of ZDA may be that of the receiver's own clock.
+        fixed: the last GGA or RMC has a fix; None before the first. Without one, the date of ZDA may be that of the
+            receiver's own clock.
+        early: arguments of `_day` by the last ZDA before the first GGA or RMC, which says whether it counts.
     """
 
     near_ns: int
@@ -32,7 +34,8 @@ class _Log:
     stamps: list[int] = field(default_factory=list)
     at: list[float] = field(default_factory=list)
     sigmas: dict[float, tuple[float, float, float]] = field(default_factory=dict)
-    fixed: bool = True
+    fixed: bool | None = None
+    early: tuple[datetime, float] | None = None
 
     def add(self, line: str) -> None:
         """One line; anything but a whole sentence with the right checksum is ignored."""
@@ -42,20 +45,28 @@ class _Log:
         kind, *words = body.split(",")
         try:
             if kind.endswith("GGA") and len(words) > 10:
-                self.fixed = int(words[5] or 0) > 0
+                self._hear(fixed=int(words[5] or 0) > 0)
                 if self.fixed:
                     self._place(words)
             elif kind.endswith("GST") and len(words) > 7 and words[5]:
                 north, east, up = (float(word) for word in words[5:8])
                 self.sigmas[_seconds(words[0])] = east, north, up
             elif kind.endswith("RMC") and len(words) > 8:
-                self.fixed = words[1] == "A"
+                self._hear(fixed=words[1] == "A")
                 if self.fixed and words[8]:
-                    self._day(datetime.strptime(words[8], "%d%m%y"), words[0])
-            elif kind.endswith("ZDA") and len(words) > 3 and words[3] and self.fixed:
-                self._day(datetime.strptime("".join(words[1:4]), "%d%m%Y"), words[0])
+                    self._day(datetime.strptime(words[8], "%d%m%y"), _seconds(words[0]))
+            elif kind.endswith("ZDA") and len(words) > 3 and words[3] and self.fixed is not False:
+                day = datetime.strptime("".join(words[1:4]), "%d%m%Y"), _seconds(words[0])
+                if self.fixed:
+                    self._day(*day)
+                self.early = day
         except ValueError:
             return
+
+    def _hear(self, *, fixed: bool) -> None:
+        if fixed and self.fixed is None and self.early:
+            self._day(*self.early)
+        self.fixed = fixed
 
     def _place(self, words: list[str]) -> None:
         latitude, longitude = _degrees(words[1], words[2]), _degrees(words[3], words[4])
@@ -65,8 +76,8 @@ class _Log:
         self.at.append(at)
         self.near_ns = self.stamps[-1]
 
-    def _day(self, day: datetime, time: str) -> None:
-        at = round(_seconds(time) * 1e9)
+    def _day(self, day: datetime, at_s: float) -> None:
+        at = round(at_s * 1e9)
         stamp_ns = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + at
         off = round((stamp_ns - _nearest(at * 1e-9, self.near_ns)) / (_DAY_S * 1e9)) * round(_DAY_S * 1e9)
         if off:  # the day was guessed so far

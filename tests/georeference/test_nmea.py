@@ -52,6 +52,8 @@ def test_a_date_of_zda_counts_only_while_there_is_a_fix(void: str) -> None:
         ([sentence(void), cold, GGA], 764_426_000 * 10**9),
         ([GGA, warm, sentence(void), cold], day_before),
         ([warm, GGA], day_before),
+        ([cold, sentence(void), GGA], 764_426_000 * 10**9),
+        ([cold, warm, GGA, sentence(void), cold], day_before),
     ):
         fixes, _ = nmea.read(lines, "log", near_ns)
         assert (fixes.stamps_ns == 764_426_119 * 10**9).all()
