@@ -12,6 +12,8 @@ from app.georeference.fixes import Fixes
 from app.slam.errors import HemislamError
 
 _DAY_S = 86_400.0
+_YEARS = range(1980, 2200)
+"""Since GPS time began, and as far as stamps in ns go."""
 _NOBODY = (float("nan"),) * 3
 
 
@@ -60,7 +62,7 @@ class _Log:
                 if self.fixed:
                     self._day(*day)
                 self.early = day
-        except ValueError:
+        except (ValueError, OverflowError, KeyError):
             return
 
     def _hear(self, *, fixed: bool) -> None:
@@ -71,12 +73,14 @@ class _Log:
     def _place(self, words: list[str]) -> None:
         latitude, longitude = _degrees(words[1], words[2]), _degrees(words[3], words[4])
         at = _seconds(words[0])
+        self.near_ns = _nearest(at, self.near_ns)
         self.places.append((latitude, longitude, float(words[8]), float(words[10] or "nan")))
-        self.stamps.append(_nearest(at, self.near_ns))
+        self.stamps.append(self.near_ns)
         self.at.append(at)
-        self.near_ns = self.stamps[-1]
 
     def _day(self, day: datetime, at_s: float) -> None:
+        if day.year not in _YEARS:
+            return
         at = round(at_s * 1e9)
         stamp_ns = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + at
         off = round((stamp_ns - _nearest(at * 1e-9, self.near_ns)) / (_DAY_S * 1e9)) * round(_DAY_S * 1e9)
@@ -105,7 +109,7 @@ def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
 def _degrees(text: str, side: str) -> float:
     """ddmm.mmmm and N, S, E or W."""
     whole, minutes = divmod(float(text), 100.0)
-    return (whole + minutes / 60.0) * (-1.0 if side in "SW" else 1.0)
+    return (whole + minutes / 60.0) * {"N": 1.0, "E": 1.0, "S": -1.0, "W": -1.0}[side]
 
 
 def _seconds(text: str) -> float:

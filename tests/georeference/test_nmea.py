@@ -59,6 +59,22 @@ def test_a_date_of_zda_counts_only_while_there_is_a_fix(void: str) -> None:
         assert (fixes.stamps_ns == 764_426_119 * 10**9).all()
 
 
+@pytest.mark.parametrize(
+    "absurd",
+    [
+        "GPZDA,123519.00,23,03,9999,00,00",
+        "GPZDA,123519.00,23,03,0001,00,00",
+        "GPGGA,1235inf,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,",
+        "GPGGA,123520,4807.038,,01131.000,E,1,08,0.9,545.4,M,46.9,M,,",
+        "GPGGA,123520,4807.038,N,01131.000,X,1,08,0.9,545.4,M,46.9,M,,",
+    ],
+)
+def test_a_sentence_that_cannot_be_is_ignored_though_its_checksum_is_right(absurd: str) -> None:
+    for lines in ([GGA, sentence(absurd), GGA], [sentence(absurd), GGA, GGA]):
+        fixes, _ = nmea.read(lines, "log", 764_426_000 * 10**9)
+        assert (fixes.stamps_ns == 764_426_119 * 10**9).all() and fixes.latitude == pytest.approx(48.1173)
+
+
 def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
     fixes, _ = nmea.read([GGA, sentence("GPGST,123519,0.006,0.023,0.020,273.6,0.023,0.020,0.031")], "log", 0)
     assert fixes.sigmas[0].tolist() == [0.020, 0.023, 0.031]  # GST names north first
