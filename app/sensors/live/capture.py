@@ -7,7 +7,7 @@ are recognised by their content, whatever their ports. Those of a second LiDAR a
 import bisect
 from abc import ABC, abstractmethod
 from array import array
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from ipaddress import ip_address
@@ -42,6 +42,9 @@ _RUN_IN = 2
 
 _FAR_NS = 1 << 62
 """The year 2116; later stamps are cut to it, so that integers hold them."""
+
+_WILD_NS = 10_000_000_000
+"""A log time that is further from those around it is not that of its packet."""
 
 V = TypeVar("V")
 Shifts = list[tuple[int, int]]
@@ -119,8 +122,8 @@ class PacketStream(ABC):
 
         def datagrams() -> Iterator[tuple[int, Datagram]]:
             nonlocal at, running_ns
-            for datagram in self._capture.datagrams(place):
-                at, running_ns = datagram.place, max(running_ns, datagram.time_ns)
+            for time_ns, datagram in _without_wild_times(self._capture.datagrams(place), running_ns):
+                at, running_ns = datagram.place, max(running_ns, time_ns)
                 yield running_ns, datagram
 
         for content in self._contents(datagrams()):
@@ -302,6 +305,22 @@ class CaptureStream(PacketStream):
         if device and device.T_imu_lidar is not None:
             found.append(mount_finding(device.T_imu_lidar))
         return found
+
+
+def _without_wild_times(datagrams: Iterator[Datagram], before_ns: int) -> Iterator[tuple[int, Datagram]]:
+    """Each with its log time, or that of a neighbour if it is far from both of them.
+
+    Args:
+        before_ns: the log time before the first; 0: there is none, and the two after it are compared.
+    """
+    ahead = deque(islice(datagrams, 2))
+    while ahead:
+        ahead.extend(islice(datagrams, 1))
+        datagram = ahead.popleft()
+        after = [one.time_ns for one in ahead] or [before_ns or datagram.time_ns]
+        middle_ns = sorted((before_ns or after[-1], datagram.time_ns, after[0]))[1]
+        before_ns = middle_ns if abs(datagram.time_ns - middle_ns) > _WILD_NS else datagram.time_ns
+        yield before_ns, datagram
 
 
 def _value_at(rows: list[tuple[int, V]], log_ns: int) -> V:

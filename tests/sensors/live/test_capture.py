@@ -204,6 +204,25 @@ def test_a_clock_set_on_the_way_does_not_end_the_recording(tmp_path: Path) -> No
     assert len(measurements(path)) == TURNS
 
 
+@pytest.mark.parametrize("at", [0, 1, 500, -1])
+@pytest.mark.parametrize("wild_ns", [1_000_000_000, 2_208_988_800_000_000_000])
+def test_a_single_wild_log_time_spoils_no_other(tmp_path: Path, at: int, wild_ns: int) -> None:
+    """1970, as of a recorder without a clock, or 2040."""
+    entries = sorted(walk())
+    (tmp_path / "whole.pcap").write_bytes(captures.pcap(entries))
+    entries[at] = (wild_ns, *entries[at][1:])
+    (tmp_path / "wild.pcap").write_bytes(captures.pcap(entries))
+    topics = ("/rslidar_points", "/imu/data")
+    whole, wild = (list(CaptureStream(tmp_path / f"{n}.pcap").messages(topics, 0, 2**62)) for n in ("whole", "wild"))
+    assert len(whole) == len(wild)
+    assert max(abs(one[1] - other[1]) for one, other in zip(whole, wild, strict=True)) < 10_000_000
+    stream = CaptureStream(tmp_path / "wild.pcap")
+    assert stream.end_ns - stream.start_ns == pytest.approx(whole[-1][1] - whole[0][1], abs=10_000_000)
+    start = wild[len(wild) // 2][1]
+    rest = [entry[:2] for entry in stream.messages(topics, start, 2**62)]
+    assert rest == [entry[:2] for entry in wild if entry[1] >= start]
+
+
 def test_a_clock_that_leaps_over_all_of_time_leaves_stamps_that_integers_hold(tmp_path: Path) -> None:
     """Both leaps fall into one moment of the capture, so that all of their samples get the shift of the last."""
     at = sensor.START_NS + 3 * TURN_NS + 1_000_000
