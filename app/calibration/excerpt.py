@@ -71,6 +71,12 @@ def read_excerpt(
     measurements = _longest_part(measurements)
     usable = [measurement.scan for measurement in measurements[1:] if len(measurement.scan)]
     imu = _samples(measurements)
+    if measurements and not usable:
+        near, far = params.sensor.min_range, params.sensor.max_range
+        raise HemislamError(
+            f"None of the {len(measurements)} scans of {recording.path} has a return within {near:g} to {far:g} m"
+            " (sensor.min_range, sensor.max_range); `hemislam info` shows how far they are."
+        )
     if len(usable) < LEAST_SCANS or len(imu) < 10:
         raise HemislamError(
             f"{recording.path} has {len(usable)} usable scans and {len(imu)} IMU samples; calibration needs"

@@ -15,9 +15,13 @@ SAME_M, SAME_SHARE, SAME_LINES = 0.001, 0.05, 3
 
 
 def distance_findings(scans: list[Scan], params: SensorParams) -> list[Finding]:
-    """Coordinates that are not in metres, or missing returns written as a distance, in a recording's first scans."""
+    """Coordinates in other units, all out of range, or missing returns written as a distance, in the first scans."""
     distances = np.linalg.norm(np.concatenate([scan.points for scan in scans]).astype(np.float64), axis=1)
-    return _not_metres(distances) or _missing(distances, np.concatenate([scan.ring for scan in scans]), params)
+    return (
+        _not_metres(distances)
+        or _out_of_range(distances, params)
+        or _missing(distances, np.concatenate([scan.ring for scan in scans]), params)
+    )
 
 
 def _not_metres(distances: F64) -> list[Finding]:
@@ -28,6 +32,17 @@ def _not_metres(distances: F64) -> list[Finding]:
     text = (
         f"half of the points are beyond {usual:.0f} m and hardly any within {nearest:.0f} m: x, y and z seem to be in "
         f"{unit}; make the driver write metres, or divide them by {parts}"
+    )
+    return [Finding("distances", "needs you", text)]
+
+
+def _out_of_range(distances: F64, params: SensorParams) -> list[Finding]:
+    if ((distances > params.min_range) & (distances < params.max_range)).any():
+        return []
+    text = (
+        f"none of the {len(distances):,} points of the first scans lies within {params.min_range:g} to "
+        f"{params.max_range:g} m (sensor.min_range, sensor.max_range): the nearest {distances.min():.3g} m, the "
+        f"farthest {distances.max():.3g} m away; check both limits and the LiDAR's driver"
     )
     return [Finding("distances", "needs you", text)]
 

@@ -112,7 +112,7 @@ def probe_clouds(source: Source, topic: Topic) -> tuple[list[Probe], list[Findin
         if len(probes) == PROBED_CLOUDS:
             break
     if not probes:
-        why = reason or "each is empty, or all of its points are NaN or zero"
+        why = reason or "each is empty, or all of its points are beyond 10 km, NaN or zero"
         raise HemislamError(
             f"None of the {unusable} point clouds on {topic.name} in {source.path} has a usable point ({why}); "
             "check the LiDAR's driver, or choose another topic by --lidar-topic."

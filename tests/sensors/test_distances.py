@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.calibration.excerpt import read_excerpt
 from app.sensors.findings import Finding
 from app.sensors.recording import open_recording
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from tests.sensors import rig
 
@@ -61,3 +63,24 @@ def test_coordinates_that_are_not_in_metres_are_named(unit: str, parts: int, tmp
 @pytest.mark.parametrize("times", [0.2, 1.0, 10.0])
 def test_metres_in_a_cabin_or_in_a_field_are_fine(times: float, tmp_path: Path) -> None:
     assert found(tmp_path, lambda made: made.points * times) == []
+
+
+def test_a_recording_without_any_return_in_range_is_named_by_the_doctor_and_by_calibration(tmp_path: Path) -> None:
+    (finding,) = found(tmp_path, lambda made: made.points * np.float32(0.01))
+    assert finding.verdict == "needs you"
+    assert "none of the" in finding.text and "0.4 to 100 m" in finding.text and "farthest 0.08" in finding.text
+    with (
+        open_recording(tmp_path / "walk", Params()) as recording,
+        pytest.raises(HemislamError, match=r"None of the 4 scans .* has a return .* 0.4 to 100 m") as refused,
+    ):
+        read_excerpt(recording, Params())
+    assert "hemislam info" in str(refused.value)
+
+
+@pytest.mark.parametrize("spoilt", [np.inf, 5e4, np.nan, 0.0])
+def test_clouds_without_a_valid_return_are_counted_and_what_can_be_wrong_is_named(
+    spoilt: float, tmp_path: Path
+) -> None:
+    with pytest.raises(HemislamError, match="None of the 4 point clouds on /points") as refused:
+        found(tmp_path, lambda made: np.full_like(made.points, spoilt))
+    assert "beyond 10 km, NaN or zero" in str(refused.value) and "check the LiDAR's driver" in str(refused.value)
