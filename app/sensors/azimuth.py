@@ -97,6 +97,17 @@ def sense_of_rotation(points: F32, ring: U16) -> tuple[bool, float]:
     return clockwise, _laps(points, ring, clockwise)
 
 
+def share_of_turn(firsts: F32, clockwise: bool, turns: float) -> float:
+    """Share of a turn that each message holds; 1 unless each begins where the one before ends.
+
+    Args:
+        firsts: (n, 3) first point of each of n successive messages. turns: that one of them makes.
+    """
+    steps = np.mod(np.diff(turned_azimuth(firsts, clockwise)), 2 * np.pi) / (2 * np.pi)
+    share = float(np.median(steps)) if len(steps) else 1.0
+    return share if share < 0.6 and abs(turns - share) < 0.3 * share else 1.0
+
+
 def _laps(points: F32, ring: U16, clockwise: bool) -> float:
     """Turns that a typical ring makes in this order and sense."""
     _, begins, turned_by = _along_rings(turned_azimuth(points, clockwise), ring)

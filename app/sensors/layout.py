@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.sensors.azimuth import sense_of_rotation, settle_spin
+from app.sensors.azimuth import sense_of_rotation, settle_spin, share_of_turn
 from app.sensors.cloud_types import POINT_CLOUD_2, CloudMessage, CloudType, Probe
 from app.sensors.findings import Finding
 from app.sensors.pointcloud import CloudLayout
 from app.sensors.rings import settle_rings
-from app.sensors.timing import Timing, settle_timing
+from app.sensors.timing import Timing, scan_period_ns, settle_timing
 from app.slam.errors import HemislamError
 from app.slam.sections import RecordingParams
 from app.slam.types import F32, U16
@@ -50,11 +50,18 @@ def settle_cloud(
         if not spin.ordered:
             text = f"{time_findings[0].text}; but the order of the points shows no rotation, so this is a guess"
             time_findings[0] = replace(time_findings[0], verdict="needs you", text=text)
+        else:
+            _, turns = sense_of_rotation(*clouds[0])
+            share = share_of_turn(np.stack([points[0] for points, _ in clouds]), spin.clockwise, turns)
+            if share < 1.0:
+                rate = share * 1e9 / scan_period_ns(probes, 0.0)[0]
+                time_findings[0] = _of_parts(time_findings[0], share, rate, chosen.rotation_rate)
         if spin.start is None:  # then only the cloud's own first or last point can be at the header stamp
             timing = replace(timing, anchor="last" if timing.shift_ns else "first", shift_ns=0)
     else:
         if rings.of_lines:
-            time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing))
+            firsts = np.stack([probe.points[probe.column(timing.field).argmin()] for probe in probes])
+            time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing, firsts))
     layout = CloudLayout(
         timing=timing,
         rings=rings,
@@ -71,8 +78,23 @@ def settle_cloud(
     return layout, findings
 
 
-def _rotation_finding(cloud: tuple[F32, U16], time: npt.NDArray[Any], timing: Timing) -> Finding:
-    """Whether the azimuth follows the points' times, as it must on a rotating sensor."""
+def _of_parts(found: Finding, share: float, rate: float, chosen_rate: float) -> Finding:
+    """The finding on times from the azimuth, where each message holds this share of a turn."""
+    text = f"the sensor turns {rate:.3g} times a second, and {_held(share)}; times are {found.text}"
+    if abs(chosen_rate - rate) < 0.1 * rate:
+        return replace(found, verdict="corrected", text=text)
+    return replace(found, verdict="needs you", text=text, option=f"--set recording.rotation_rate={rate:.3g}")
+
+
+def _held(share: float) -> str:
+    return (
+        f"each message holds {360 * share:.0f} degrees of a turn, and mapping is better with 360: make the driver "
+        "publish whole turns, if it can"
+    )
+
+
+def _rotation_finding(cloud: tuple[F32, U16], time: npt.NDArray[Any], timing: Timing, firsts: F32) -> Finding:
+    """Whether the azimuth follows the points' times, as it must on a rotating sensor. firsts: as `share_of_turn`."""
     points, ring = cloud
     order = np.argsort(time, kind="stable")
     clockwise, turns = sense_of_rotation(points[order], ring[order])
@@ -80,7 +102,12 @@ def _rotation_finding(cloud: tuple[F32, U16], time: npt.NDArray[Any], timing: Ti
         period_s = float(time.max() - time.min()) * timing.unit_ns / 1e9 / turns
         sense = "clockwise" if clockwise else "counter-clockwise"
         text = f"the points' times follow their azimuth: one turn in {period_s:.4f} s, {sense} seen from +z"
-        return Finding("rotation", "fine", text)
+        share = share_of_turn(firsts, clockwise, turns)
+        return (
+            Finding("rotation", "needs you", f"{text}; {_held(share)}")
+            if share < 1
+            else Finding("rotation", "fine", text)
+        )
     text = (
         "the points' times do not follow their azimuth: either the sensor does not rotate, or the times are made up "
         "and should be derived from the azimuth"

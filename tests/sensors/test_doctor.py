@@ -11,7 +11,9 @@ from rosbags.typesys import get_types_from_msg
 
 from app.sensors.doctor import examine
 from app.sensors.findings import Finding
+from app.sensors.recording import ScanEntry, open_recording
 from app.slam.params import Params
+from app.slam.types import Scan
 from tests.sensors import rig
 
 MOUNTED = Params().merged({"sensor": {"translation": [0.1, 0.0, 0.0]}})
@@ -226,3 +228,42 @@ def test_the_gravity_finding_follows_the_imu(tmp_path: Path) -> None:
     found = by_subject(rig.write(tmp_path / "walk", entries))
     assert "LiDAR's +x axis" in found["gravity"].text
     assert f"down is {np.degrees(np.arctan2(1.0, 9.7)):.0f} deg" in found["gravity"].text
+
+
+def in_parts(parts: int, layout: rig.Layout, columns: int = 90, seen: float = 1.0) -> list[rig.Entry]:
+    """A walk whose driver publishes so many messages a turn. seen: the share of each message that has returns."""
+    entries = [entry for entry in rig.walk(turns=6, columns=8) if entry[0] == "/imu"]
+    for number in range(6):
+        made = rig.turn(number, columns)
+        for slots in np.array_split(np.arange(len(made)), parts):
+            part = made.only(slots[: round(len(slots) * seen)])
+            sent = rig.message(part, layout)
+            end_ns = made.begin_ns + int(made.offsets_ns[slots[-1]])
+            sent.header = rig.header(end_ns, 2)
+            entries.append(("/points", end_ns + 3_000_000, sent))
+    return sorted(entries, key=lambda entry: entry[1])
+
+
+UNTIMED = rig.Layout(fields=[("x", "f4", "x"), ("y", "f4", "y"), ("z", "f4", "z"), ("ring", "u2", "ring")])
+
+
+@pytest.mark.parametrize(("parts", "degrees"), [(2, 180), (5, 72), (10, 36)])
+def test_messages_that_hold_a_part_of_a_turn_are_told_with_what_to_do(parts: int, degrees: int, tmp_path: Path) -> None:
+    told = f"each message holds {degrees} degrees of a turn"
+    timed = by_subject(rig.write(tmp_path / "timed", in_parts(parts, rig.Layout())))["rotation"]
+    assert told in timed.text and "publish whole turns" in timed.text and timed.verdict == "needs you"
+    path = rig.write(tmp_path / "untimed", in_parts(parts, UNTIMED))
+    untimed = by_subject(path)["point time"]
+    assert told in untimed.text and "turns 10 times a second" in untimed.text and untimed.verdict == "needs you"
+    assert untimed.option == "--set recording.rotation_rate=10"
+    settled = by_subject(path, MOUNTED.with_values({"recording.rotation_rate": 10.0}))["point time"]
+    assert told in settled.text and settled.verdict == "corrected"
+    with open_recording(path, MOUNTED.with_values({"recording.rotation_rate": 10.0})) as recording:
+        scans = [one.scan for one in recording.entries() if isinstance(one, ScanEntry) and isinstance(one.scan, Scan)]
+    assert scans[1].offsets_ns.max() == pytest.approx(rig.PERIOD_NS / parts, rel=0.15)
+
+
+@pytest.mark.parametrize("layout", [rig.Layout(), UNTIMED])
+def test_a_whole_turn_of_which_only_a_part_has_returns_is_no_part_of_a_turn(layout: rig.Layout, tmp_path: Path) -> None:
+    found = by_subject(rig.write(tmp_path / "walk", in_parts(1, layout, seen=0.3)))
+    assert not [finding for finding in found.values() if "each message holds" in finding.text]
