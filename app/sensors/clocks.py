@@ -28,7 +28,8 @@ def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
     if spread > TOLERANCE_S:
         text = (
             f"the offset between the LiDAR's and the IMU's stamps changes by {spread:.3f} s on the way: a clock "
-            "was set or drifts; use a part before that (--start, --duration), and one clock for both next time"
+            "was set or drifts; map a part before that (start hemislam with --start and --duration), and use one clock "
+            "for both next time"
         )
         return Finding("clocks", "needs you", text)
     offset = _offset_s(scans, imu)

@@ -97,8 +97,8 @@ def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[ImuUnits, list
     norm = float(np.median(np.linalg.norm(probe.accel, axis=1)))
     if norm == 0.0:
         raise HemislamError(
-            "The accelerometer reads 0 on all axes, which none does on Earth; check the IMU's driver, or choose "
-            "another topic by --imu-topic."
+            "The accelerometer reads 0 on all axes, which none does on Earth; check the IMU's driver, or start "
+            "hemislam with --imu-topic and another topic."
         )
     accel_unit, findings = _acceleration_unit(norm, chosen.acceleration_unit)
     accel = _reordered(probe.accel, accel_axes) * accel_unit

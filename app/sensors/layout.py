@@ -38,7 +38,7 @@ def settle_cloud(
     if chosen.time_field not in ("auto", "none") and chosen.time_field not in fields:
         raise HemislamError(
             f"The clouds of {where} have no field `{chosen.time_field}` for the time; they have "
-            f"{', '.join(fields)}: choose one by --set recording.time_field=NAME, or `none`."
+            f"{', '.join(fields)}: start hemislam with --set recording.time_field=NAME, or `none`."
         )
     timing, time_findings = settle_timing(probes, kind, chosen)
     probes = [probe for cloud in probes if len((probe := replace(cloud, time=timing.field)).points)]

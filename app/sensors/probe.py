@@ -47,7 +47,7 @@ def choose_topic(source: Source, sensor: Literal["lidar", "imu"], wanted: str) -
         found = next((topic for topic in source.topics if topic.name == wanted), None)
         why = "no topic" if found is None else ("no messages on" if found.type in kinds else f"no {content} on")
         others = " or ".join(option + topic.name for topic in candidates)
-        hint = f"use {others}" if others else f"it has {listed}"
+        hint = f"start hemislam with {others}" if others else f"it has {listed}"
         raise HemislamError(f"{source.path} has {why} {wanted}; {hint}.")
     if not candidates:
         empty = [topic.name for topic in source.topics if topic.type in kinds]
@@ -115,7 +115,7 @@ def probe_clouds(source: Source, topic: Topic) -> tuple[list[Probe], list[Findin
         why = reason or "each is empty, or all of its points are beyond 10 km, NaN or zero"
         raise HemislamError(
             f"None of the {unusable} point clouds on {topic.name} in {source.path} has a usable point ({why}); "
-            "check the LiDAR's driver, or choose another topic by --lidar-topic."
+            "check the LiDAR's driver, or start hemislam with --lidar-topic and another topic."
         )
     if len(probes) == 1:
         raise HemislamError(

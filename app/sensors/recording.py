@@ -252,7 +252,7 @@ class Recording(AbstractContextManager["Recording"]):
             except CloudError as error:
                 reason = str(error)
         if not decoded:
-            advice = next((f"{f.text.rstrip('.')}: try {f.option}" for f in findings if f.verdict == "needs you"), "")
+            advice = next((f.spoken.rstrip(".") for f in findings if f.verdict == "needs you"), "")
             raise HemislamError(
                 f"The clouds on {self.lidar_topic} in {self.path} make no scans: {reason}"
                 f"; {advice or 'check the recording.time_* settings'}."
@@ -265,7 +265,7 @@ class Recording(AbstractContextManager["Recording"]):
             until = "" if duration_s is None else f" and before {start_s + duration_s:g} s"
             return f"{self.path} has no scan after {start_s:g} s{until}; it lasts {self.duration_s:.1f} s."
         reason, count = reasons.most_common(1)[0]
-        hint = f"{self._clocks.text}: try {self._clocks.option}" if self._clocks.option else "run `hemislam info` on it"
+        hint = self._clocks.spoken if self._clocks.option else "run `hemislam info` on it"
         return f"None of the {reasons.total()} scans of {self.path} can be used ({count} times: {reason}); {hint}."
 
     def close(self) -> None:

@@ -173,7 +173,9 @@ class Source(AbstractContextManager["Source"]):
                 at = (log_ns - self.start_ns) / 1e9
                 advice = _repair(self.path)
                 if at > 1:
-                    advice = f"what comes before can be used (--duration {at - 0.5:.1f}), and {advice}"
+                    advice = (
+                        f"what comes before can be used (start hemislam with --duration {at - 0.5:.1f}), and {advice}"
+                    )
                 raise HemislamError(
                     f"{self.path} is damaged {at:.1f} s after its start ({_brief(error)}); {advice}."
                 ) from error

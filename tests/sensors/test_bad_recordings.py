@@ -23,6 +23,8 @@ def refusal(path: Path, params: Params | None = None) -> str:
     sentence = str(caught.value)
     assert "\n" not in sentence and sentence.endswith(".")
     assert "Traceback" not in sentence and "Error(" not in sentence
+    options = [word for word in sentence.split() if word.strip("(`'").startswith("--")]
+    assert not options or "start hemislam with" in sentence, "the page shows it, too, and has no command line"
     return sentence
 
 

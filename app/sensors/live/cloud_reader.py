@@ -61,8 +61,8 @@ class CloudReader:
             self._fields = cloud.fields
         if not {"x", "y", "z"} <= cloud.fields.keys():
             raise HemislamError(
-                f"The clouds on {self._topic} have no x, y, z, but {', '.join(cloud.fields)}; choose another by "
-                "--lidar-topic."
+                f"The clouds on {self._topic} have no x, y, z, but {', '.join(cloud.fields)}; start hemislam with "
+                "--lidar-topic and another topic."
             )
         if not len(probe.points):
             self._unusable += 1
