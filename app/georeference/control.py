@@ -49,6 +49,8 @@ def align_with_points(
     there, at = np.array([places[one] for one in names]), np.array([picked[one] for one in names])
     if not np.isfinite(there).all():
         raise HemislamError(f"A control point of {control.source} lacks a coordinate; fill it in or remove it.")
+    if lost := next((one for one, place in zip(names, at, strict=True) if not np.isfinite(place).all()), None):
+        raise HemislamError(f"Control point {lost} was picked at no place of the map; pick it again.")
     _refuse_line(at[used], count)
     ground = Ground.in_grid(there, name)
     _refuse_line(ground.places[used], count)

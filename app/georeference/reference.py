@@ -84,6 +84,15 @@ class GeoReference:
                 f"This is not a georeference ({'.'.join(map(str, first['loc']))}: {first['msg']}); write a new one with"
                 " hemislam georeference."
             ) from None
+        R = np.array(read.rotation)
+        sound = (
+            np.isfinite(read.origin).all() and 0.01 < read.scale < 100.0 and np.allclose(R @ R.T, np.eye(3), atol=1e-3)
+        )
+        if not sound:
+            raise HemislamError(
+                "This is not a georeference (its numbers are no place, no rotation or no scale); write a new one with"
+                " hemislam georeference."
+            )
         crs.projected(read.crs)
         return read
 

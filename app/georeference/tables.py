@@ -159,7 +159,7 @@ def _nanoseconds(word: str) -> int:
         return int(np.int64(int(Decimal(word).scaleb(9).to_integral_value())))
     except InvalidOperation:
         date = np.datetime64(word.removesuffix("Z"), "ns")
-        if np.isnat(date):
+        if np.isnat(date) or date.astype("M8[s]") != np.datetime64(word.removesuffix("Z"), "s"):  # it wraps around
             raise ValueError from None
         return int(date.astype(np.int64))
 

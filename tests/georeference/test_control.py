@@ -144,3 +144,12 @@ def test_a_point_that_the_user_leaves_out_pulls_nothing_and_still_shows_how_far_
     found = laid(control, picks, grid="EPSG:32632", overridden={"D": False})
     assert found.used.tolist() == [True, True, True, False] and found.rms.max() < 1e-5
     assert np.linalg.norm(found.residuals[3]) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_pick_that_is_no_place_is_refused_by_its_name(number: float, tmp_path: Path) -> None:
+    """A session file may hold any number."""
+    control, picks = written(tmp_path, CORNERS)
+    picked = read_picks(read_table(picks, *PICKS)) | {"C": np.array([1.0, number, 0.0])}
+    with pytest.raises(HemislamError, match="C was picked at no place"):
+        align_with_points(read_table(control, *CONTROL), picked, grid="EPSG:32632")

@@ -24,6 +24,11 @@ def test_a_step_ahead_of_a_map_turned_to_the_north_goes_north() -> None:
     assert (east, north, height) == pytest.approx((0.0, 10.0, 2.0), abs=1e-8)
 
 
+def test_a_web_mercator_map_in_the_far_north_is_read_as_written() -> None:
+    where = GeoReference("EPSG:3857", ORIGIN, scale=reference.crs.grid_scale("EPSG:3857", 78.2, 15.6, 0.0))
+    assert where.scale > 4 and GeoReference.from_json(where.to_json()) == where
+
+
 def test_there_and_back_keeps_a_micrometre() -> None:
     points = np.random.default_rng(1).uniform(-500, 500, (100, 3))
     where = reference_of(33.0, scale=0.99961)
@@ -54,7 +59,14 @@ def test_a_georeference_is_read_from_its_file_as_it_was_written(tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("{}", "not a georeference"), ('{"crs": "EPSG:4326", "origin": [0, 0, 0]}', "not a plane grid")],
+    [
+        ("{}", "not a georeference"),
+        ('{"crs": "EPSG:4326", "origin": [0, 0, 0]}', "not a plane grid"),
+        ('{"crs": "EPSG:32632", "origin": [NaN, 0, 0]}', "not a georeference .*its numbers"),
+        ('{"crs": "EPSG:32632", "origin": [0, 0, 0], "scale": 0}', "not a georeference .*its numbers"),
+        ('{"crs": "EPSG:32632", "origin": [0, 0, 0], "scale": NaN}', "not a georeference .*its numbers"),
+        ('{"crs": "EPSG:32632", "origin": [0, 0, 0], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 0]]}', "its numbers"),
+    ],
 )
 def test_a_file_that_is_no_georeference_is_refused_in_one_sentence(text: str, words: str) -> None:
     with pytest.raises(HemislamError, match=words):

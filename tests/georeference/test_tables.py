@@ -91,6 +91,8 @@ def checksum(sentence: str) -> str:
         ("time,lat,lon,height\n" + "noon,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "1700000000000,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "nan,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("time,lat,lon,height\n" + "9999-01-01,48,11,5\n" * 3, "neither Unix seconds nor a date"),
+        ("time,lat,lon,height\n" + "1600-01-01T10:00:00Z,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "inf,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ("time,lat,lon,height\n" + "1e999999,48,11,5\n" * 3, "neither Unix seconds nor a date"),
         ('time,lat,"lon,height\n' + "1,48,11,5\n" * 20_000, "a quotation mark without its pair"),
