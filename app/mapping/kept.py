@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
-from pydantic import PlainSerializer, PlainValidator
+from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 from app.export.box import Box
 from app.mapping.painted import Stroke, entry_of, stroke_of
@@ -67,8 +67,11 @@ class Clip:
 
 
 WHOLE = Clip()
+_NOTE = TypeAdapter(tuple[int, str])
 _Note = Annotated[
-    Note, PlainValidator(lambda entry: Note(*entry)), PlainSerializer(lambda note: (note.frame, note.text))
+    Note,
+    PlainValidator(lambda entry: Note(*_NOTE.validate_python(entry))),
+    PlainSerializer(lambda note: (note.frame, note.text)),
 ]
 _Stroke = Annotated[Stroke, PlainValidator(stroke_of), PlainSerializer(entry_of)]
 

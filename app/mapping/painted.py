@@ -78,8 +78,9 @@ def entry_of(stroke: Stroke) -> dict[str, Any]:
 
 
 def stroke_of(entry: dict[str, Any]) -> Stroke:
-    """Raises KeyError, TypeError, ValueError or zlib.error: it is no stroke."""
-    count, packed = int(entry["points"]), zlib.decompress(b64decode(entry["touched"]))
+    """Raises KeyError, TypeError, ValueError, OverflowError or zlib.error: it is no stroke."""
+    count = int(entry["points"])
+    packed = zlib.decompressobj().decompress(b64decode(entry["touched"]), max(count, 0) // 8 + 2)
     if len(packed) != -(-count // 8):
         raise ValueError(f"{count} points have another number of bits")
     return Stroke(int(entry["stamp_ns"]), count, _MARKS[entry["mark"]], packed)
@@ -99,5 +100,5 @@ def read_json(text: str, name: str) -> tuple[Stroke, ...]:
         if tree["hemislam_labels"] != 1:
             raise ValueError("another version")
         return tuple(map(stroke_of, tree["strokes"]))
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError, zlib.error) as error:
         raise HemislamError(f"{name} holds no labels of hemislam ({error}); download them under Study.") from None

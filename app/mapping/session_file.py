@@ -55,6 +55,9 @@ MOST_POINTS = 1 << 24
 """Of a keyframe: far more than any scan has."""
 
 
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
 @dataclass(frozen=True, slots=True)
 class Opened:
     """What a session was opened on.
@@ -64,8 +67,8 @@ class Opened:
     """
 
     recording: Path
-    start_s: float = 0.0
-    duration_s: float | None = None
+    start_s: _Finite = 0.0
+    duration_s: _Finite | None = None
     nbytes: int = 0
 
 

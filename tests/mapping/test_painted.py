@@ -1,5 +1,8 @@
 """Marks of the brush: the newest stroke counts, undo is a shorter list, and files hold them."""
 
+import tracemalloc
+import zlib
+from base64 import b64encode
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.mapping.painted import UNMARKED, Stroke, marks, read_json, strokes_of, to_json
+from app.mapping.painted import UNMARKED, Stroke, marks, read_json, stroke_of, strokes_of, to_json
 from app.mapping.session_file import Opened, SavedSession, State, read_marks, write_session
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -48,7 +51,17 @@ def test_a_file_brings_the_same_marks_back(painted: list[Stroke]) -> None:
     assert strokes_of(again) == strokes_of(marks(painted))
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"hemislam_labels": 2}', '{"hemislam_labels": 1, "strokes": [{}]}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "[" * 100_000,
+        '{"hemislam_labels": 2}',
+        '{"hemislam_labels": 1, "strokes": [{}]}',
+        '{"hemislam_labels": 1, "strokes": [{"points": Infinity, "touched": "", "stamp_ns": 1, "mark": "none"}]}',
+    ],
+)
 def test_a_file_that_holds_no_labels_is_refused_in_a_sentence(text: str) -> None:
     with pytest.raises(HemislamError, match=r"walk\.json holds no labels"):
         read_json(text, "walk.json")
@@ -58,6 +71,16 @@ def test_bits_that_do_not_fit_the_points_are_refused() -> None:
     text = to_json([stroke(5, 0, 3, GROUND)]).replace(f'"points": {POINTS}', '"points": 99')
     with pytest.raises(HemislamError, match="99 points"):
         read_json(text, "walk.json")
+
+
+def test_marks_that_unpack_to_more_than_a_scan_are_refused_before_memory_is_full(tmp_path: Path) -> None:
+    bomb = b64encode(zlib.compress(bytes(200_000_000))).decode()
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="another number of bits"):
+        stroke_of({"points": 99, "touched": bomb, "stamp_ns": 1, "mark": "none"})
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 10_000_000
 
 
 def test_a_session_file_keeps_the_strokes_and_a_search_reads_their_marks(tmp_path: Path) -> None:

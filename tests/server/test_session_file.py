@@ -149,6 +149,22 @@ def test_a_clip_that_cannot_be_is_left_out_with_a_sentence(saved: SavedSession, 
     assert replace(read, left_out="") == saved
 
 
+NOTES = [{"notes": [["x", "late"]]}, {"notes": [[1, None]]}]
+
+
+@pytest.mark.parametrize("wrong", [{"start_s": math.nan}, {"duration_s": math.inf}, *NOTES])
+def test_numbers_and_words_that_cannot_be_are_damage(
+    saved: SavedSession, tmp_path: Path, wrong: dict[str, Any]
+) -> None:
+    path = tmp_path / "a.hemislam"
+    write_session(path, saved)
+    head, entry = map(json.loads, path.read_text().splitlines())
+    entry["state"] |= wrong
+    path.write_text(f"{json.dumps(head | wrong)}\n{json.dumps(entry)}\n")
+    with pytest.raises(HemislamError, match="is damaged"):
+        read_session(path)
+
+
 def test_a_session_whose_clip_cannot_be_opens_in_the_page_and_says_so(tmp_path: Path) -> None:
     bench = Kept(tmp_path)
     bench.do(StepFrame())
