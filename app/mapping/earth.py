@@ -97,7 +97,7 @@ def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool])
     table = table_of(survey.control.splitlines(), "The table of control points", *CONTROL)
     picked = {}
     for pick in survey.picks:
-        if pick.keyframe < len(results.keyframes):
+        if 0 <= pick.keyframe < len(results.keyframes):
             T = results.frame.at(pick.keyframe) @ results.keyframes[pick.keyframe].T_odom_imu
             picked[pick.name] = lie.moved(T, pick.at)
     return align_with_points(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overridden=overridden)
