@@ -5,6 +5,8 @@ Tests app/mapping/opening.py, app/mapping/saving.py.
 
 import math
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -110,30 +112,50 @@ def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     return walk_round(tmp_path_factory.mktemp("simulated") / "room.mcap", perfect=request.param == "perfect")
 
 
+@dataclass
+class Played:
+    """A workbench that played to the end, and what it saved then."""
+
+    workbench: Workbench
+    folder: Path
+    saved: dict[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
+    workbench = Workbench(recording)
+    ended = workbench.do(Play())
+    assert ended.transport.finished and accepted(ended)
+    folder = tmp_path_factory.mktemp("undisturbed")
+    yield Played(workbench, folder, workbench.saved(folder))
+    workbench.controller.close()
+
+
 @pytest.fixture
-def workbench(recording: Path) -> Workbench:
-    return Workbench(recording)
+def played(undisturbed: Played) -> Iterator[Played]:
+    """Without edits, which each test leaves it."""
+    yield undisturbed
+    while undisturbed.workbench.do().loops.undo:
+        undisturbed.workbench.do(UndoLoop())
 
 
 def test_an_undisturbed_session_a_replay_and_a_run_write_the_same(
-    recording: Path, workbench: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Path, undisturbed: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On the sample, all three look for loops in another process; in the rooms only the page does, to save time."""
     if recording != SAMPLE:
         monkeypatch.setattr("app.mapping.opening.open_session", partial(open_session, loops=InlineLoops))
-    ended = workbench.do(Play())
-    assert ended.transport.finished and accepted(ended)
-    ours = workbench.saved(tmp_path / "page")
-    workbench.controller.close()
-    assert hemislam(tmp_path / "run", "run", str(recording), *SHORT) == ours
-    assert hemislam(tmp_path / "replay", "replay", str(tmp_path / "page" / f"session{SUFFIX}")) == ours
+    session = undisturbed.folder / f"session{SUFFIX}"
+    assert hemislam(tmp_path / "run", "run", str(recording), *SHORT) == undisturbed.saved
+    assert hemislam(tmp_path / "replay", "replay", str(session)) == undisturbed.saved
 
 
 @pytest.mark.parametrize("recording", ROOMS, indirect=True)
 def test_a_session_with_detours_edits_other_parameters_and_a_fork_is_replayed_to_the_same(
-    workbench: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The page has a process for its loops. The replays look for them in this one, which saves six starts."""
+    workbench = Workbench(recording)
     monkeypatch.setattr("app.mapping.opening.open_session", partial(open_session, loops=InlineLoops))
     opened = workbench.do().recording
     assert opened is not None
@@ -159,33 +181,32 @@ def test_a_session_with_detours_edits_other_parameters_and_a_fork_is_replayed_to
 
 
 @pytest.mark.parametrize("recording", ["imperfect"], indirect=True)
-def test_playing_again_from_the_end_or_restarting_keeps_the_edits(workbench: Workbench, tmp_path: Path) -> None:
-    last = accepted(workbench.do(Play()))[-1].pair
-    unedited = workbench.saved(tmp_path / "unedited")
+def test_playing_again_from_the_end_or_restarting_keeps_the_edits(played: Played, tmp_path: Path) -> None:
+    workbench = played.workbench
+    last = accepted(workbench.do())[-1].pair
     workbench.do(EditLoop(Reject(*last)), AddNote("a door"))
     edited = workbench.saved(tmp_path / "edited")
-    assert edited != unedited
+    assert edited != played.saved
     assert workbench.do(Play()).transport.finished
     assert workbench.saved(tmp_path / "played") == edited
     restarted = workbench.do(Restart(), Play())
     assert restarted.transport.finished and restarted.notes[-1].text == "a door"
     assert restarted.loops.undo == (Reject(*last),) and last not in [edge.pair for edge in accepted(restarted)]
     workbench.do(UndoLoop())
-    assert workbench.saved(tmp_path / "undone") == unedited
-    workbench.controller.close()
+    assert workbench.saved(tmp_path / "undone") == played.saved
 
 
 @pytest.mark.parametrize("recording", ["imperfect"], indirect=True)
 def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(
-    recording: Path, workbench: Workbench, tmp_path: Path
+    recording: Path, played: Played, tmp_path: Path
 ) -> None:
-    first, *_, last = (edge.pair for edge in accepted(workbench.do(Play())))
+    workbench = played.workbench
+    first, *_, last = (edge.pair for edge in accepted(workbench.do()))
     workbench.do(EditLoop(Reject(*first)), EditLoop(SetWeight(*last, 0.1)))
     snapshot = workbench.do(EditLoop(Accept(*first)), UndoLoop(), RedoLoop(), UndoLoop())
     path = tmp_path / "edits.yaml"
     path.write_text(edit_files.write(snapshot.loops.undo) + "- accept: [1, 2]\n")
     ours = workbench.saved(tmp_path / "page")
-    workbench.controller.close()
     printed = call(tmp_path / "headless", "run", str(recording), *SHORT, "--loops", str(path))
     assert "Accept 1-2 has no effect" in printed
     assert read(tmp_path / "headless") == ours
