@@ -26,6 +26,9 @@ from app.slam.types import F64, Keyframe
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, same
 from tests.slam.loops.walks import drive, error, revisits, take
 
+LAP = 80
+"""Keyframes after which the walk of `walked` sees again what it saw at first."""
+
 
 def misplaced(poses: F64, truth: F64) -> float:
     """m, root mean square after alignment."""
@@ -102,7 +105,7 @@ def test_storeys_that_look_alike_stay_above_one_another() -> None:
 
 
 def test_where_odometry_was_seen_to_break_loops_outvote_it_however_far_off_it_is(walked: Walked) -> None:
-    keyframes, at = walked.walk.drifted(0.003, 0.005), 20
+    keyframes, at = walked.walk.drifted(0.003, 0.005)[: LAP + 30], 20  # further on, it is not seen across the break
     here = lie.transform(np.eye(3), keyframes[at].T_odom_imu[:3, 3])
     leap = lie.transform(lie.exp(np.array([0.0, 0.0, np.radians(20.0)])), np.array([0.6, -0.3, 0.8]))
     broken = [
@@ -130,12 +133,12 @@ def paused(
 @pytest.mark.parametrize("moved", [(0.0, 0.0, 0.0), (3.0, -1.5, 0.2)])
 def test_loops_tie_the_parts_of_a_walk_that_was_paused(walked: Walked, moved: tuple[float, float, float]) -> None:
     """Whether the walker came back to where the pause began or went on meanwhile."""
-    keyframes, at = walked.walk.drifted(0.003, 0.005), 60
+    keyframes, at = walked.walk.drifted(0.003, 0.005)[: LAP + 30], 60
     backend = drive(tuple(paused(keyframes, at, 15.0, moved)), PARAMS)
     across = [edge for edge in accepted(backend) if edge.older < at <= edge.newer]
     assert len(across) > 5
     assert max(error(edge, walked.walk.truth)[0] for edge in across) < 0.3
-    assert misplaced(backend.poses, walked.walk.truth) < 0.1
+    assert misplaced(backend.poses, walked.walk.truth[: len(keyframes)]) < 0.1
     stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes])
     ends = np.array([stamps_ns[at], stamps_ns[-1] + 1])
     assert tied_pauses(across, stamps_ns, ends).tolist() == [stamps_ns[at]]
