@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from app.server.folders import Folders
 from app.server.fork import Workspace
+from app.server.protocol import StepFrame
 from app.ui.workbench import Workbench
 from tests.ui.conftest import icons_read_once  # noqa: F401 - a fixture
 from tests.ui.fake_engine import FakeEngine
@@ -91,6 +92,15 @@ class Bench:
             return self.within(1.5, holds)
 
         self.eventually(pressed)
+
+    def next_frame(self) -> None:
+        """Step, and wait until the page shows it, hence all that was sent before, and has answered.
+
+        viser gathers for 50 ms what a page says, and a page draws every 100 ms.
+        """
+        self.engine.send(StepFrame())
+        expect(self.page.get_by_text(f"frame {self.engine.snapshot.transport.frame} of")).to_be_visible()
+        self.page.wait_for_timeout(300)
 
     def look(self, position: Any, look_at: Any) -> None:
         """Put the page's camera somewhere, and wait until it is there.

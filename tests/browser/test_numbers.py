@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Locator, expect
 
 from app.server.keeping import SetClip
-from app.server.protocol import SetParams, StepFrame
+from app.server.protocol import SetParams
 from tests.browser.conftest import Bench
 
 
@@ -37,10 +37,9 @@ def set_params(bench: Bench) -> list[dict[str, object]]:
 def test_a_number_is_taken_whole_on_enter_whatever_the_engine_sends_meanwhile(bench: Bench) -> None:
     alpha = boxes(bench, "α")
     type_over(bench, alpha, "25")
-    bench.engine.send(StepFrame(3))
-    bench.page.wait_for_timeout(800)
+    bench.next_frame()
     bench.page.keyboard.type(".7")
-    bench.page.wait_for_timeout(800)
+    bench.next_frame()
     assert set_params(bench) == []
     bench.page.keyboard.press("Enter")
     bench.eventually(lambda: set_params(bench) == [{"ground.alpha": 25.7}])
@@ -61,10 +60,7 @@ def test_a_number_is_taken_when_its_box_is_left_with_all_its_digits(bench: Bench
             type_over(bench, boxes(bench, name), str(value))
             bench.page.keyboard.press("Tab")
         bench.eventually(lambda values=values: values in set_params(bench)[-1].values())
-        bench.engine.send(StepFrame())  # what the page shows of it comes after its answer to the numbers
-        frame = bench.engine.snapshot.transport.frame
-        expect(bench.page.get_by_text(f"frame {frame} of 0–399")).to_be_visible()
-        bench.page.wait_for_timeout(300)  # three frames
+        bench.next_frame()  # what the page shows of it comes after its answer to the numbers
         assert [float(boxes(bench, name).input_value()) for name in names] == list(values)
     bench.page.get_by_text("Sensor", exact=True).click()
 
@@ -82,7 +78,7 @@ def test_escape_restores_the_number_and_one_out_of_range_is_not_taken(bench: Ben
     assert alpha.evaluate("(box) => box.validationMessage") == "1 to 90"
     bench.page.keyboard.press("Tab")
     expect(alpha).to_have_value("40")
-    bench.page.wait_for_timeout(800)
+    bench.next_frame()
     assert set_params(bench) == []
 
 

@@ -179,9 +179,12 @@ def test_the_bar_stays_and_works_while_the_panel_is_closed(bench: Bench) -> None
 
 def test_the_bar_fits_its_window_and_the_map_the_room_above(bench: Bench) -> None:
     dock, framing = bench.page.locator("body > * > .hs-dock"), bench.workbench._scene.framing
+    scene = bench.page.locator("canvas[data-engine]")
     for width in (1024, 780, 1000):
+        before = scene.bounding_box()
         bench.page.set_viewport_size({"width": width, "height": 620})
-        bench.page.wait_for_timeout(1000)  # the bar follows the scene
+        bench.eventually(lambda before=before: scene.bounding_box() != before)
+        bench.page.wait_for_timeout(500)  # the bar follows the scene every 300 ms
         assert dock.evaluate("(dock) => dock.scrollWidth <= dock.clientWidth"), f"{width} px"
     folded = framing.pictures
     bench.page.get_by_role("button", name="Diagnostics").click()
@@ -364,7 +367,7 @@ def test_a_side_of_the_clip_box_is_pulled_by_its_handle(bench: Bench) -> None:
     panel = bench.workbench._clip
     bench.eventually(lambda: len(panel._handles) == 7)
     bench.eventually(lambda: np.allclose(panel._handles[1].position, handle(before, *FACES[1])[1]))
-    bench.page.wait_for_timeout(2000)
+    bench.next_frame()
     (client,) = bench.server.get_clients().values()
     scene = bench.page.locator("canvas[data-engine]").bounding_box()
     assert scene is not None
@@ -373,7 +376,7 @@ def test_a_side_of_the_clip_box_is_pulled_by_its_handle(bench: Bench) -> None:
     at = np.array([scene["x"], scene["y"]]) + picture * [scene["width"], scene["height"]]
     along = (at[1] - at[0]) / np.linalg.norm(at[1] - at[0])
     bench.page.mouse.move(*(at[0] + 40 * along))
-    bench.page.wait_for_timeout(1000)
+    bench.page.wait_for_timeout(500)
     bench.page.mouse.down()
     for pixels in (45, 55, 75, 100):
         bench.page.mouse.move(*(at[0] + pixels * along))

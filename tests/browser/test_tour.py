@@ -30,7 +30,8 @@ def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -
         bench.engine.send(Pause())
         page.reload()
         expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
-        page.wait_for_timeout(3000)
+        page.wait_for_function("Boolean(window.hemislamTour)")
+        page.wait_for_timeout(1700)  # it would begin after 1.5 s
         expect(tour).to_have_count(0)
         page.get_by_role("tab", name="Help").click()
         page.get_by_role("button", name="Tour of one minute").click()
