@@ -103,6 +103,14 @@ def receiving(record: Path) -> Iterator[tuple[LiveProcess, LiveClient, Sender]]:
         client.close()
 
 
+def until_told(process: LiveProcess) -> None:
+    """Its owner knows what it knows now."""
+    now_ns, deadline = time.time_ns(), time.monotonic() + TIMEOUT_S
+    while process._known.at_ns < now_ns:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def kill(process: LiveProcess) -> None:
     """And wait until there is another one, or none any more."""
     killed = process.pid
@@ -122,7 +130,7 @@ def test_a_receiver_that_is_killed_comes_back_and_records_into_a_further_file(tm
         last, deadline = sender.turns[-1], time.monotonic() + TIMEOUT_S
         while (before := client.state()).recorded == 0 or last - 1 not in recorded(record):  # the disk may be slow
             assert time.monotonic() < deadline
-        time.sleep(0.5)  # what is known is told five times a second
+        until_told(process)
         kill(process)
         while client.state().counters.restarts == 0:  # it is asked all the time, and never in vain
             sender.poll()
@@ -153,7 +161,7 @@ def test_scans_that_waited_for_the_engine_when_it_died_are_reported(tmp_path: Pa
         time.sleep(2.0)  # the last revolution is complete after a second of silence
         waiting = client.state().backlog
         assert waiting >= 5
-        time.sleep(0.5)  # what is known is told five times a second
+        until_told(process)
         kill(process)
         while not (told := [e for e in sender.events if isinstance(e, Status) and e.kind == "restarted"]):
             sender.poll()
