@@ -4,6 +4,7 @@ import datetime
 import functools
 import math
 import struct
+from itertools import chain
 
 START = datetime.datetime(2026, 3, 1, 12, 0, 0, tzinfo=datetime.UTC)
 START_NS = int(START.timestamp()) * 10**9
@@ -20,6 +21,7 @@ OFFSETS_US = [
 
 Block = tuple[int, list[tuple[int, int]]]
 """Azimuth in 0.01 deg, and 32 times (distance in steps, intensity)."""
+BLOCK = struct.Struct(">2sH" + 32 * "HB")
 
 
 def msop(stamp_ns: int, blocks: list[Block], *, v4: bool = False, index: int = 0) -> bytes:
@@ -35,10 +37,7 @@ def msop(stamp_ns: int, blocks: list[Block], *, v4: bool = False, index: int = 0
             us % 10**6 // 1000, us % 1000,
         )  # fmt: skip
     head = bytes.fromhex("55aa050a5aa550a0") + bytes(12) + time + bytes([0, 3, 4] if v4 else [0, 3, 1]) + bytes(9)
-    body = b""
-    for azimuth, channels in blocks:
-        body += b"\xff\xee" + struct.pack(">H", azimuth)
-        body += b"".join(struct.pack(">HB", distance, intensity) for distance, intensity in channels)
+    body = b"".join(BLOCK.pack(b"\xff\xee", azimuth, *chain.from_iterable(channels)) for azimuth, channels in blocks)
     packet = head + body + struct.pack(">IH", index, 0)
     assert len(packet) == 1248
     return packet
@@ -91,14 +90,15 @@ def turns(
     per_turn = 10**9 // rate // block_ns
     firings: list[tuple[int, Block]] = []
     for turn in range(count):
+        first = [(distance + turn, channel) for channel in range(32)]
+        second = [(distance + turn + 7 * (channel > 0), channel) for channel in range(32)]
         for number in range(per_turn):
             azimuth = number * 36000 // per_turn
             if not fov[0] <= azimuth < fov[1]:
                 continue
             time = start_ns + (turn * per_turn + number) * block_ns
-            firings.append((time, (azimuth, [(distance + turn, channel) for channel in range(32)])))
+            firings.append((time, (azimuth, first)))
             if dual:
-                second = [(distance + turn + 7 * (channel > 0), channel) for channel in range(32)]
                 firings.append((time, (azimuth, second)))
     packets = []
     for index, at in enumerate(range(0, len(firings) - 11, 12)):

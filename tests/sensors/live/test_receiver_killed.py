@@ -38,7 +38,7 @@ class Sender:
 
     def turn(self, count: int, *, polling: bool = True) -> int:
         """So many, of the sensor that turned all the time. Returns the number of the first."""
-        first = math.ceil(self._now() + 15)  # making the packets takes time, and they must not be late
+        first = math.ceil(self._now() + 8)  # making the packets takes time, and they must not be late
         packets = sensor.turns(count, start_ns=sensor.START_NS + first * TURN_NS)
         thread = threading.Thread(target=self._send, args=(first, packets))
         thread.start()
