@@ -63,12 +63,15 @@ def test_a_click_on_an_arch_shows_the_loop_whatever_tab_is_open(bench: Bench) ->
     x = box[0] + box[2] / 2 + focal * (knob[0] - 12.0) / depth
     y = box[1] + box[3] / 2 - focal * (knob[1] - 7.0) / depth
 
-    def clicked() -> bool:
-        page.mouse.click(x, y)
-        return bench.within(2.0, lambda: bench.workbench._loops.chosen == GOOD)
+    shown = page.get_by_text("keyframes 12–89")
 
-    bench.eventually(clicked)  # a page that is still busy may drop a click
-    expect(page.get_by_text("keyframes 12–89")).to_be_visible()
+    def clicked() -> bool:
+        if bench.workbench._loops.chosen != GOOD:
+            page.mouse.click(x, y)
+        return bench.within(2.0, lambda: bench.workbench._loops.chosen == GOOD and shown.is_visible())
+
+    bench.eventually(clicked)  # a page that is still busy may drop a click, or say late that a tab was opened before it
+    expect(shown).to_be_visible()
 
 
 def test_a_loop_is_rejected_undone_and_rejected_again(bench: Bench) -> None:
