@@ -112,7 +112,7 @@ def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]
         results = georeference_if_possible(results, session.survey, session.edits.done)
         folder = out or free_folder(source)
         if results.where is None:
-            results.where, problem = reference.read_if_possible(source.parent)
+            results.where, problem = reference.read(source.parent)
             if problem and folder.resolve() == source.parent.resolve():
                 raise HemislamError(f"{problem} Choose another folder as --out, so that the file stays.")
             results.problem = results.problem or problem

@@ -38,7 +38,7 @@ def read_results(folder: Path) -> Results:
         g2o = None
     loops = LoopResults(MapFrame(), np.empty(0, np.int64), (), g2o) if g2o is not None else None
     info = RunInfo(recording_of(folder) or folder, Params())
-    where, problem = reference.read_if_possible(folder)
+    where, problem = reference.read(folder)
     return Results(log, MapFile(folder / "map.ply"), info, loops, where=where, problem=problem)
 
 

@@ -28,7 +28,7 @@ class _Log:
         sigmas: m to the east, north and up by s of the day.
         fixed: the last GGA or RMC has a fix; None before the first. Without one, the date of ZDA may be that of the
             receiver's own clock.
-        early: arguments of `_day` by the last ZDA before the first GGA or RMC, which says whether it counts.
+        early: day and s of it, by the last ZDA before the first GGA or RMC, which says whether it counts.
     """
 
     near_ns: int
@@ -47,25 +47,26 @@ class _Log:
         kind, *words = body.split(",")
         try:
             if kind.endswith("GGA") and len(words) > 10:
-                self._hear(fixed=int(words[5] or 0) > 0)
+                self._set_fixed(int(words[5] or 0) > 0)
                 if self.fixed:
                     self._place(words)
             elif kind.endswith("GST") and len(words) > 7 and words[5]:
                 north, east, up = (float(word) for word in words[5:8])
                 self.sigmas[_seconds(words[0])] = east, north, up
             elif kind.endswith("RMC") and len(words) > 8:
-                self._hear(fixed=words[1] == "A")
+                self._set_fixed(words[1] == "A")
                 if self.fixed and words[8]:
                     self._day(datetime.strptime(words[8], "%d%m%y"), _seconds(words[0]))
-            elif kind.endswith("ZDA") and len(words) > 3 and words[3] and self.fixed is not False:
+            elif kind.endswith("ZDA") and len(words) > 3 and words[3]:
                 day = datetime.strptime("".join(words[1:4]), "%d%m%Y"), _seconds(words[0])
                 if self.fixed:
                     self._day(*day)
-                self.early = day
+                elif self.fixed is None:
+                    self.early = day
         except (ValueError, OverflowError, KeyError):
             return
 
-    def _hear(self, *, fixed: bool) -> None:
+    def _set_fixed(self, fixed: bool) -> None:
         if fixed and self.fixed is None and self.early:
             self._day(*self.early)
         self.fixed = fixed

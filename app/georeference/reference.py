@@ -100,19 +100,12 @@ class GeoReference:
 _ADAPTER = TypeAdapter(GeoReference)
 
 
-def read(folder: Path) -> GeoReference | None:
-    """That of the results in a folder; None if they have none. Raises HemislamError: it cannot be used."""
+def read(folder: Path) -> tuple[GeoReference | None, str]:
+    """That of the results in a folder, if there is one that can be used; else why it is not used, "" without any."""
     try:
-        return GeoReference.from_json((folder / FILE).read_bytes())
+        return GeoReference.from_json((folder / FILE).read_bytes()), ""
     except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise HemislamError(f"{folder / FILE} cannot be read: {error.strerror}.") from None
-
-
-def read_if_possible(folder: Path) -> tuple[GeoReference | None, str]:
-    """As `read`; where that fails, None and the reason, in a sentence."""
-    try:
-        return read(folder), ""
-    except HemislamError as error:
-        return None, f"The georeference of {folder / FILE} is not used: {error}"
+        return None, ""
+    except (HemislamError, OSError) as error:
+        why = f"it cannot be read: {error.strerror}." if isinstance(error, OSError) else error
+        return None, f"The georeference of {folder / FILE} is not used: {why}"

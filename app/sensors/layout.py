@@ -103,11 +103,9 @@ def _rotation_finding(cloud: tuple[F32, U16], time: npt.NDArray[Any], timing: Ti
         sense = "clockwise" if clockwise else "counter-clockwise"
         text = f"the points' times follow their azimuth: one turn in {period_s:.4f} s, {sense} seen from +z"
         share = share_of_turn(firsts, clockwise, turns)
-        return (
-            Finding("rotation", "needs you", f"{text}; {_held(share)}")
-            if share < 1
-            else Finding("rotation", "fine", text)
-        )
+        if share < 1.0:
+            return Finding("rotation", "needs you", f"{text}; {_held(share)}")
+        return Finding("rotation", "fine", text)
     text = (
         "the points' times do not follow their azimuth: either the sensor does not rotate, or the times are made up "
         "and should be derived from the azimuth"

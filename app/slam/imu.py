@@ -18,6 +18,7 @@ ROT, POS, VEL, BG, BA, GRAV, EXT_ROT, EXT_POS = (
 """Order of the 23 error dimensions: rotation (IMU frame), position, velocity (odom), gyro bias, accel
 bias, gravity (2, tangent of S²), extrinsic rotation (LiDAR frame), extrinsic translation (IMU frame)."""
 POSE, MOTION, EXT = slice(0, 6), slice(0, 9), slice(17, 23)
+"""Pose; pose and velocity; extrinsics."""
 
 MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""

@@ -53,8 +53,8 @@ def test_a_hundred_metres_on_the_ground_are_a_hundred_metres_on_the_ellipsoid() 
 def test_a_georeference_is_read_from_its_file_as_it_was_written(tmp_path: Path) -> None:
     where = reference_of(12.3456789, scale=0.9996123, height="orthometric (EGM2008)")
     (tmp_path / reference.FILE).write_text(where.to_json())
-    assert reference.read(tmp_path) == where
-    assert reference.read(tmp_path / "nowhere") is None
+    assert reference.read(tmp_path) == (where, "")
+    assert reference.read(tmp_path / "nowhere") == (None, "")
 
 
 @pytest.mark.parametrize(
