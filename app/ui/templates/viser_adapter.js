@@ -2,28 +2,30 @@
 if (!window.hemislamSay) {
   // A click (or Enter) on an element with data-hs: write its word into the hidden field, whose changes viser sends.
   // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, of
-  // all controls together. So a word waits until nothing has changed for three ticks, not even by the word before; of
-  // two words that ask for the same thing the later one counts. A page that is busy may run two timers in the wrong
-  // order once both are late, so ticks are counted, not milliseconds: viser's own timer has run by the next tick.
-  const TICK_MS = 20, QUIET_TICKS = 3;
-  let said = 0, ticking = 0, quiet = 0;
+  // all controls together. So a word waits until nothing has changed for as long, not even by the word before; of two
+  // words that ask for the same thing the later one counts. On a busy page viser's timer may be late and run after ours,
+  // but it has run by the time of a further timer, which is set only then.
+  const QUIET_MS = 60;
+  let said = 0, sending = 0, changed = -QUIET_MS;
   const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set, waiting = new Map();
   for (const kind of ['input', 'click', 'keydown', 'pointermove']) {
     document.addEventListener(kind, (event) => {
       if (event.target.closest?.('canvas,[data-hs-to]') || (kind === 'pointermove' && !event.buttons)) return;
-      if (kind !== 'keydown' || event.target.closest?.('[role=slider]')) quiet = 0;
+      if (kind !== 'keydown' || event.target.closest?.('[role=slider]')) changed = performance.now();
     }, true);
   }
-  const tick = () => {
-    const [next] = waiting;
-    ticking = next ? setTimeout(tick, TICK_MS) : 0;
-    if (!next || quiet++ < QUIET_TICKS) return;
+  const send = (again) => {
+    const rest = changed + QUIET_MS - performance.now(), [next] = waiting;
+    sending = next && (rest > 0 || !again) ? setTimeout(send, Math.max(rest, 0), rest <= 0) : 0;
+    if (sending || !next) return;
     const [key, [name, word]] = next, bridge = document.querySelector(`.hs-bridge[data-name="${name}"]`);
     waiting.delete(key);
     const input = bridge?.parentElement.previousElementSibling.querySelector('input'); // or it was taken off the page
-    if (!input) return;
-    set.call(input, word + ' #' + (++said) + Math.random().toString(36).slice(2, 6));
-    input.dispatchEvent(new Event('input', {bubbles: true}));
+    if (input) {
+      set.call(input, word + ' #' + (++said) + Math.random().toString(36).slice(2, 6));
+      input.dispatchEvent(new Event('input', {bubbles: true}));
+    }
+    send(false);
   };
   window.hemislamSay = (event) => {
     const element = event.target.closest && event.target.closest('[data-hs]');
@@ -31,7 +33,7 @@ if (!window.hemislamSay) {
     const name = element.closest('[data-hs-to]').dataset.hsTo, word = element.dataset.hs;
     if (event.detail > 1 && /^(delete|drop) /.test(word)) return; // of a double click, the second one meets the next line
     waiting.set(name + ' ' + word.split(' ')[0], [name, word]);
-    if (!ticking) { quiet = 0; tick(); }
+    if (!sending) send(false);
   };
 
   // On a phone the panel is low, its tabs alone, until one is tapped; the same one lowers it again.
