@@ -44,8 +44,8 @@ def results(made: Walked, tmp_path: Path) -> Path:
 def test_a_file_of_fixes_places_the_map_and_names_each_wild_fix(hemislam: Call, made: Walked, results: Path) -> None:
     outcome = hemislam("georeference", results, "--gnss", results / "fixes.csv", "--lever-arm", *LEVER)
     assert outcome.code == 0, outcome.err
-    found = reference.read(results)
-    assert found is not None and found.crs == "EPSG:32632"
+    found, problem = reference.read(results)
+    assert found is not None and problem == "" and found.crs == "EPSG:32632"
     assert np.sqrt((off(found, made.trajectory) ** 2).mean()) < 0.02
     rejected = {line.split()[0] for line in outcome.out.splitlines() if "rejected" in line}
     assert {str(number) for number in made.outliers} <= rejected | {"719", "720"}  # after the last pose
@@ -112,7 +112,7 @@ def test_a_wild_fix_that_the_user_insists_on_pulls_walk_and_map_alike(
     verdicts = {int(row["name"]): row["verdict"] for row in rows}
     assert (verdicts[wild], verdicts[sound]) == ("accepted", "rejected")
     left = {"trajectory.tum", "map.ply", "georeference.json", "gnss_residuals.csv", "georeference.svg"}
-    assert {path.name for path in bent.iterdir()} == left and reference.read(results) is None
+    assert {path.name for path in bent.iterdir()} == left and reference.read(results) == (None, "")
     walk, keyframes = read_tum(bent / "trajectory.tum").positions, map_file.MapFile(bent / "map.ply")
     assert np.linalg.norm(walk - made.trajectory.positions, axis=1).max() > 0.01
     for k in (0, 30, 60):
