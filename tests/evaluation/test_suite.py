@@ -10,10 +10,12 @@ import pytest
 from scipy.spatial import KDTree
 
 from app.evaluation.paper import SEQUENCES
+from app.sensors.simulator.imperfections import IMPERFECT, Imperfections
 from app.sensors.simulator.scenes import build_scene
-from app.sensors.simulator.simulate import trajectory_through
-from app.sensors.simulator.suite import PAPER, REVISITS, Twin, find_suite, fitting_speed, make_twin
+from app.sensors.simulator.simulate import simulate, trajectory_through, unit_of
+from app.sensors.simulator.suite import PAPER, REVISITS, Twin, find_suite, fitting_speed, make_twin, unit_seed
 from app.sensors.simulator.trajectory import Walker
+from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.trajectory import read_tum
 
@@ -82,3 +84,21 @@ def test_a_twin_is_made_once_and_the_same_every_time(tmp_path: Path) -> None:
     assert other.recording.name == "indoor_2-seed1.mcap"
     assert other.recording.read_bytes() != made.recording.read_bytes()
     assert make_twin(twin, first, every_block=15).new  # other firings, another recording
+
+
+def test_each_imperfect_walk_has_a_scanner_of_its_own(tmp_path: Path) -> None:
+    """With one scanner for a suite, its mean errors would be those of that scanner."""
+    walks = [(twin, seed) for twin in (*PAPER, *REVISITS) for seed in (0, 1)]
+    turns = np.array([lie.log(unit_of(IMPERFECT, unit_seed(*walk)).mounting[:3, :3]) for walk in walks])
+    assert len(np.unique(turns.round(9), axis=0)) == len(walks)
+    assert np.abs(np.degrees(turns.mean(axis=0))).max() < 3 * 0.7 / np.sqrt(3 * len(walks))
+
+    twin, errors = Twin("indoor_2", 50, 1.0), Imperfections(gyro_scale=0.1)
+    made = make_twin(twin, tmp_path, every_block=30, imperfections=errors).recording.read_bytes()
+    walker = Walker(speed=fitting_speed(twin, 0))
+    for seed, same in ((unit_seed(twin, 0), True), (None, False)):
+        simulate(
+            "indoor_2", tmp_path / "own.mcap", duration_s=twin.duration_s, every_block=30, walker=walker,
+            imperfections=errors, unit_seed=seed,
+        )  # fmt: skip
+        assert ((tmp_path / "own.mcap").read_bytes() == made) is same

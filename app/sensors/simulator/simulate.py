@@ -75,6 +75,7 @@ def simulate(
     coordinate_step: float = 0.0,
     walker: Walker | None = None,
     imperfections: Imperfections = NONE,
+    unit_seed: int | None = None,
     scanner: str = "bpearl",
     tables: Path | None = None,
     upright: bool | None = None,
@@ -99,6 +100,7 @@ def simulate(
             0.00390625, makes the file a third smaller.
         walker: how the person walks; None = the defaults.
         imperfections: errors of a real scanner and hand, and people beside the operator.
+        unit_seed: of the errors that one scanner has all the time; None: `seed`.
         scanner: a name in SCANNERS. tables: folder with its maker's tables, where it takes some.
         upright: held with the LiDAR's z up rather than looking forward; None: as usual for it.
         gnss: a satellite receiver beside; where the world truly lies is then in `<stem>_georeference.json`.
@@ -121,7 +123,8 @@ def simulate(
     company = companions(imperfections.companions, trajectory, place, _random(seed, _PEOPLE))
     caster = Raycaster(place.mesh, (*place.movers, *company))
     turns = device.patterns(rate_hz, every_block, tables)
-    unit = None if imperfections == NONE else unit_of(imperfections, seed, turns(0).channels)
+    unit_seed = seed if unit_seed is None else unit_seed
+    unit = None if imperfections == NONE else unit_of(imperfections, unit_seed, turns(0).channels)
     lidar = replace(
         device.lidar, range_step=range_step, coordinate_step=coordinate_step or device.lidar.coordinate_step, unit=unit
     )

@@ -7,6 +7,7 @@ each, with fewer firings.
 
 import hashlib
 import json
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -114,10 +115,16 @@ def make_twin(
         every_block=every_block,
         walker=Walker(speed=fitting_speed(twin, seed), back=twin.back),
         imperfections=imperfections,
+        unit_seed=unit_seed(twin, seed),
         progress=progress,
     )
     note.write_text(json.dumps({"made": wanted, "distance_m": made.distance_m}, indent=2) + "\n", encoding="utf-8")
     return Made(out, True, made.distance_m)
+
+
+def unit_seed(twin: Twin, seed: int) -> int:
+    """A scanner of its own for each walk: errors of a suite walked with one scanner would be those of that scanner."""
+    return zlib.crc32(f"{twin.name} {seed}".encode())
 
 
 def fitting_speed(twin: Twin, seed: int) -> float:
