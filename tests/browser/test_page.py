@@ -133,6 +133,7 @@ def test_two_drags_of_a_slider_are_two_steps_of_undo(bench: Bench) -> None:
         bench.eventually(lambda: bench.engine.snapshot.params.ground.alpha > values[-1] + 1)
         bench.eventually(lambda: history._states[-1] == bench.engine.snapshot.params and history._changed_at < 0)
         values.append(bench.engine.snapshot.params.ground.alpha)
+        bench.eventually(lambda: slider.get_attribute("aria-valuenow") == f"{values[-1]:g}")  # its thumb is there
     for value in (values[1], values[0]):
         page.get_by_role("button", name="Undo α seed angle").click()
         bench.eventually(lambda value=value: bench.engine.snapshot.params.ground.alpha == value)
@@ -346,10 +347,12 @@ def test_on_a_phone_the_scene_has_most_of_the_page_until_a_tab_is_tapped(bench: 
     above = "(dock, sheet) => sheet.getBoundingClientRect().bottom < dock.getBoundingClientRect().top + 1"
     bench.eventually(lambda: page.locator("body > * > .hs-dock").evaluate(above, sheet))
     page.get_by_role("button", name="Diagnostics").click()
-    page.get_by_role("tab", name="Help").first.click()
+    other = page.get_by_role("tab", name="Help").first
+    other.click()
+    expect(other).to_have_attribute("aria-selected", "true")
     page.wait_for_timeout(500)
     assert scene_share() < 0.45, "another tab keeps it up"
-    page.get_by_role("tab", name="Help").first.click()
+    other.click()
     bench.eventually(lambda: scene_share() > 0.6)
     page.close()
 
