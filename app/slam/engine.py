@@ -10,6 +10,7 @@ from app.slam.certainty import Certainty, Doubt
 from app.slam.clock import ClockOffset
 from app.slam.floor import Floor
 from app.slam.fusion import fuse
+from app.slam.gyroscope import GyroErrors
 from app.slam.imu import POS, Belief
 from app.slam.kernels import clouds
 from app.slam.keyframes import KeyframeStore
@@ -45,7 +46,7 @@ class EngineProgress:
         frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
         T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
         floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
-        lines: estimated errors of the scan lines. clock: estimated offset of the IMU's clock.
+        lines, gyro: estimated errors of the scan lines and of the gyroscope. clock: estimated offset of the IMU's clock.
         paused: the pause after which there is no keyframe yet; None: there is none.
         doubt: how far odometry may be off since the last keyframe.
     """
@@ -59,6 +60,7 @@ class EngineProgress:
     floor: Floor | None = None
     lines: LineErrors = field(default_factory=LineErrors.unknown)
     clock: ClockOffset = field(default_factory=ClockOffset)
+    gyro: GyroErrors = field(default_factory=GyroErrors)
     paused: Interruption | None = None
     doubt: Doubt = field(default_factory=Doubt)
 
@@ -123,7 +125,8 @@ class Engine:
         lines = before.lines if p.filter.learn_lines else LineErrors.unknown()
         clock = before.clock if p.imu.learn_clock else ClockOffset()
         scan = lines.set_right(_in_range(channels.corrected(scan, p.sensor), p.sensor))
-        samples = clock.set_right(samples)
+        gyro = before.gyro if p.imu.learn_scale else GyroErrors()
+        samples = gyro.set_right(clock.set_right(samples))
         begun = self._begin(scan, samples, end_ns)
         prediction = predict(begun.belief, begun.samples, end_ns, p.imu, clock.sigma)
         watch.lap("propagate")
@@ -147,8 +150,11 @@ class Engine:
         watch.lap("update")
 
         posterior, paused = fused.belief, begun.paused
-        if status is FrameStatus.TRACKING and fused.registration.inliers and prediction.covered and p.imu.learn_clock:
-            clock = clock.learnt(begun.samples, predicted, posterior.state)
+        if status is FrameStatus.TRACKING and fused.registration.inliers and prediction.covered:
+            if p.imu.learn_clock:
+                clock = clock.learnt(begun.samples, predicted, posterior.state)
+            if p.imu.learn_scale:
+                gyro = gyro.learnt(begun.belief.state, predicted, posterior.state)
         settling = paused is not None and not pause.is_over(paused, end_ns)
         if paused is not None and not settling:
             posterior = pause.levelled(posterior)
@@ -199,6 +205,7 @@ class Engine:
             floor=surface.floor,
             lines=lines,
             clock=clock,
+            gyro=gyro,
             paused=paused if settling else None,
             doubt=doubt if keyframe is None else replace(doubt, metres=0.0),
         )

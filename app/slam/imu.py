@@ -6,6 +6,7 @@ import numpy as np
 
 from app.slam import lie
 from app.slam.clock import USUAL_S
+from app.slam.gyroscope import GYRO_SCALE
 from app.slam.kernels import manifold, motion
 from app.slam.params import Params
 from app.slam.sections import ImuParams
@@ -24,8 +25,6 @@ MAX_KNOT_STEP = 0.0025
 """s; poses in between are interpolated linearly."""
 LONG_GAP = 0.4
 """s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
-GYRO_SCALE = 0.006
-"""Possible error of the gyroscope's turns, as a share: of scale and between its axes."""
 GAP_RATE, GAP_NOISE = 1.0, 1.0
 """rad/s, m/s²/√Hz: in a gap, standard deviation of the rate of turn and noise density of the acceleration; those of a
 walking person's hand."""

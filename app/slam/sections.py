@@ -172,6 +172,7 @@ class ImuParams(Section):
         1.0, "Time at rest that the start waits for, to measure biases and gravity.", (0.1, 10, 0.1), "s"
     )
     learn_clock: bool = _next_frame(True, "Learn the offset of the IMU's clock and correct its stamps.")
+    learn_scale: bool = _next_frame(True, "Learn how far the gyroscope's scales are off and correct its rates.")
     max_gap: float = _next_frame(
         0.1, "A longer gap between IMU samples is reported, and bridged by the LiDAR.", (0.005, 5, 0.005), "s"
     )
