@@ -14,7 +14,8 @@ from app.sensors.presets import CALIBRATED, MERGED, sidecar, uncalibrated
 from app.slam.errors import HemislamError
 from app.slam.params import nested
 from app.slam.report import finite
-from app.slam.user_text import read_yaml
+from app.slam.text_files import write_texts
+from app.slam.user_text import read_text, read_yaml
 
 WALK = "not observable: walk a figure of eight, tilting the scanner"
 
@@ -80,36 +81,38 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
     return {name: finite(value) for name, value in numbers.items()}
 
 
-def write_beside(recording: Path, found: Mapping[str, Any], *, replace: bool = False) -> Path:
+def check_beside(recording: Path) -> None:
+    """Raises HemislamError if a person wrote the parameter file beside the recording."""
+    if uncalibrated(recording) == (path := sidecar(recording)):
+        raise HemislamError(
+            f"You wrote {path} yourself; add --force to change these values in it (it is kept as .old)."
+        )
+
+
+def write_beside(recording: Path, found: Mapping[str, Any]) -> Path:
     """Store what was found, by dotted name, beside the recording, where `run`, `serve` and `info` read it.
 
-    Args:
-        replace: a file that a person wrote, too. Its other parameters stay, and it is kept as `.old`.
+    A file that a person wrote is kept as `.old`, and its other parameters stay.
 
     Raises:
-        HemislamError: nothing was found; or there is such a file.
+        HemislamError: nothing was found; or the file cannot be written, and the older one stays.
     """
     if not found:
         raise HemislamError(f"Nothing that was found in {recording} can be kept: {WALK}.")
     path = sidecar(recording)
-    text = f"{CALIBRATED}; delete this file to undo it.\n{yaml.safe_dump(nested(found), default_flow_style=None)}"
-    try:
-        mine = uncalibrated(recording)
-        if mine == path and not replace:
-            raise HemislamError(
-                f"You wrote {path} yourself; add --force to change these values in it (it is kept as .old)."
-            )
-        if mine is not None:
-            before = mine.read_text(encoding="utf-8")
-            tree = read_yaml(before, str(mine), "write it again") or {}
-            for section, values in nested(found).items():
-                tree[section] = (tree.get(section) or {}) | values
-            text = f"{MERGED}\n{yaml.safe_dump(tree, default_flow_style=None)}"
-            path.with_name(f"{path.name}.old").write_text(before, encoding="utf-8")
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise HemislamError(f"{path} cannot be written ({error.strerror}); set the values by --set.") from None
+    texts = {path.name: f"{CALIBRATED}; delete this file to undo it.\n{_yaml(nested(found))}"}
+    if (mine := uncalibrated(recording)) is not None:
+        before = read_text(mine, "write it again")
+        tree = read_yaml(before, str(mine), "write it again") or {}
+        for section, values in nested(found).items():
+            tree[section] = (tree.get(section) or {}) | values
+        texts = {f"{path.name}.old": before, path.name: f"{MERGED}\n{_yaml(tree)}"}
+    write_texts(path.parent, texts)
     return path
+
+
+def _yaml(tree: Mapping[str, Any]) -> str:
+    return str(yaml.safe_dump(tree, default_flow_style=None))
 
 
 def _if(observed: bool, text: str) -> str:

@@ -8,6 +8,7 @@ import typer
 
 from app.cli.options import ParamsFor, RecordingPath, progress_bar, with_params
 from app.slam.errors import HemislamError
+from app.slam.text_files import write_texts
 
 
 @with_params
@@ -47,6 +48,10 @@ def calibrate(
 
     if force and not write:
         raise HemislamError("--force belongs to --write; give both.")
+    if write and not force:
+        words.check_beside(recording)
+    if plot is not None and (plot.suffix != ".svg" or plot.is_dir() or not plot.parent.is_dir()):
+        raise HemislamError(f"{plot} cannot be drawn; choose a .svg file in a folder that exists as --plot.")
     params = params_for(recording, calibrated=False)
     if calibrated_beside(recording):
         typer.echo(
@@ -67,13 +72,14 @@ def calibrate(
     if plot is not None:
         from app.evaluation.plots import residual_plot
 
-        try:
-            plot.write_text(residual_plot(found), encoding="utf-8")
-        except OSError as error:
-            raise HemislamError(f"{plot} cannot be written ({error.strerror}); choose another --plot.") from None
+        write_texts(plot.parent, {plot.name: residual_plot(found)})
+    values = found.found()
+    settings = " ".join(f"--set '{name}={json.dumps(value)}'" for name, value in values.items())
     if write:
-        path = words.write_beside(recording, found.found(), replace=force)
+        try:
+            path = words.write_beside(recording, values)
+        except HemislamError as error:
+            raise HemislamError(f"{error} Instead, pass {settings}" if settings else str(error)) from None
         typer.echo(f"Saved as {path}; `run`, `serve` and `info` use it. Delete it to undo this.", err=as_json)
-    elif not as_json and found.found():
-        settings = " ".join(f"--set '{name}={json.dumps(value)}'" for name, value in found.found().items())
+    elif not as_json and settings:
         typer.echo(f"Add --write to save this beside the recording, or pass {settings}")

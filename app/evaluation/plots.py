@@ -80,7 +80,7 @@ def _before_and_after(both: F64, x_label: str, label: str) -> str:
         Line(name, colour, np.flatnonzero(np.isfinite(values)).astype(np.float64), values[np.isfinite(values)])
         for name, colour, values in zip(("before", "after"), (PALETTE[4], PALETTE[0]), both, strict=True)
     ]
-    return str(chart(lines, x_label, f"{label}, red before, blue after", from_zero=True, height=_HEIGHT))
+    return str(chart(lines, f"{x_label} (red before, blue after)", label, from_zero=True, height=_HEIGHT))
 
 
 def _cross(place: F64) -> Line:

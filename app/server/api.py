@@ -92,9 +92,9 @@ LOOPS = {
 
 
 class _Body(BaseModel):
-    """Its fields end in `_`, which requests do not see: `register` is a name that pydantic uses itself."""
+    """The body of a request. A `_` that ends a field's name is not part of it: `register` is a name of pydantic's."""
 
-    model_config = ConfigDict(alias_generator=lambda name: name.removesuffix("_"))
+    model_config = ConfigDict(extra="forbid", alias_generator=lambda name: name.removesuffix("_"))
 
 
 def _bodies(actions: Mapping[str, Action]) -> Any:
@@ -121,18 +121,18 @@ def _add_actions(
 
 
 # --- other bodies --------------------------------------------------------------------------------
-class NoteBody(BaseModel):
+class NoteBody(_Body):
     text: str = Field(min_length=1, max_length=1000)
 
 
-class OpenBody(BaseModel):
+class OpenBody(_Body):
     path: str = Field(description="A recording or session in the folders given by --folder.")
     truth: str | None = Field(
         None, description="A TUM file in the same folders; null: the one beside the recording, if any."
     )
 
 
-class CompareBody(BaseModel):
+class CompareBody(_Body):
     path: str | None = Field(None, description="A TUM file in the folders given by --folder; null ends the comparison.")
 
 

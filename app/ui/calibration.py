@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import viser
+
 from app.calibration.calibrate import is_mounting_unknown
 from app.calibration.words import table, write_beside
 from app.child import Link
@@ -58,6 +60,14 @@ class CalibrationPanel:
         self._page, self._unasked, self._resolve = page, unasked, resolve
         gui = page.gui
         self._button = add_button(gui, "Calibrate", lambda _: self._begin(), color=None, hint=_EXPLAINED, disabled=True)
+        self._stop = add_button(
+            gui,
+            "Stop",
+            lambda _: self.close(),
+            viser.Icon.PLAYER_STOP,
+            visible=False,
+            hint="What was found before stays.",
+        )
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._html = gui.add_html("", visible=False)
         self._apply = add_button(gui, "Apply", lambda _: self._apply_or_undo(), color=None, visible=False)
@@ -89,11 +99,17 @@ class CalibrationPanel:
             self._announce()
         for message in self._work.messages():
             self._show(message)
+        self._show_running()
 
     def close(self) -> None:
         """End what is under way."""
         self._work.stop()
-        self._progress.visible = False
+        self._show_running()
+
+    def _show_running(self) -> None:
+        running = self._work.running
+        self._progress.visible = self._stop.visible = running
+        self._apply.disabled = self._keep.disabled = running
 
     def _show(self, message: Any) -> None:
         if isinstance(message, float):
@@ -103,7 +119,7 @@ class CalibrationPanel:
         found = message if isinstance(message, FoundMounting) else FoundMounting([("", message)], {})
         if found.contradiction:
             found = replace(found, rows=[("", f"{found.contradiction}."), *found.rows])
-        self._found, self._before = found, {}
+        self._found, self._before, self._keep.visible = found, {}, False
         self._tell()
         self._plot.content, self._plot.visible = panel("figure", found.plot), bool(found.plot)
         self._offer()
@@ -144,11 +160,11 @@ class CalibrationPanel:
         self._asked, self._tried, self._given = asked, True, params
         self._notified.clear()
         show(self._progress, 0.0)
-        self._progress.visible, self._apply.visible, self._keep.visible = True, False, False
         try:
             self._work.begin(find, recording, self._uncalibrated(recording, params))
         except HemislamError as error:
             self._show(str(error))
+        self._show_running()
 
     def _uncalibrated(self, recording: Path, params: Params) -> Params:
         """These parameters without what was found in this recording before; else its walk would count twice."""
@@ -196,7 +212,7 @@ class CalibrationPanel:
         self._keep.visible = False
         try:
             self._file = path.read_bytes() if path.is_file() else None
-            write_beside(self._of, self._found.values, replace=True)
+            write_beside(self._of, self._found.values)
             self._tell(("kept", f"in {path}, for whenever this recording is opened"))
         except (HemislamError, OSError) as error:
             self._keep.visible = True

@@ -18,7 +18,7 @@ from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.inertial import Noise
 from app.calibration.lines import Lines
 from app.calibration.odometry import track
-from app.calibration.words import WALK, as_json, table, write_beside
+from app.calibration.words import WALK, as_json, check_beside, table, write_beside
 from app.cli.run import look_for_mounting, settle_mounting
 from app.evaluation.plots import residual_plot
 from app.sensors.presets import built_in_mounting, calibrated_beside, resolve_params, sidecar
@@ -117,10 +117,10 @@ def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path)
     mine = "# mine\nsensor:\n  max_range: 40\nfilter:\n  max_points: 700\n"
     sidecar(recording).write_text(mine)
     with pytest.raises(HemislamError, match="yourself; add --force"):
-        write_beside(recording, known(recording).found())
+        check_beside(recording)
     assert sidecar(recording).read_text() == mine
     assert calibrated_beside(recording) == ""
-    write_beside(recording, known(recording).found(), replace=True)
+    write_beside(recording, known(recording).found())
     params = resolve_params(recording, None, None, [])
     assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
     assert params.sensor.translation[0] == pytest.approx(-0.011)
@@ -140,7 +140,7 @@ def test_an_earlier_calibration_does_not_count_as_given(tmp_path: Path) -> None:
     before = resolve_params(recording, "h2lid-mount", None, [], calibrated=False)
     assert before == resolve_params(None, "h2lid-mount", None, [])
     sidecar(recording).write_text(mine)
-    write_beside(recording, known(recording).found(), replace=True)
+    write_beside(recording, known(recording).found())
     assert resolve_params(recording, None, None, [], calibrated=False) == Params().merged_yaml(mine, "mine")
     (tmp_path / "walk.params.yaml.old").unlink()  # then nothing else has the user's parameters
     assert resolve_params(recording, None, None, [], calibrated=False).sensor.max_range == 40
@@ -190,6 +190,8 @@ def test_numbers_for_programs_are_json_and_the_plot_is_an_image(tmp_path: Path) 
     assert json.loads(json.dumps(as_json(found)))["observed"]["rotation"] is True
     drawn = ElementTree.fromstring(residual_plot(found))
     assert drawn.tag.endswith("svg") and len(list(drawn.iter("{http://www.w3.org/2000/svg}polyline"))) == 4
+    labels = [text.text or "" for text in drawn.iter("{http://www.w3.org/2000/svg}text") if text.get("class") == "axis"]
+    assert len(labels) == 4 and max(map(len, labels)) < 40, "a longer one does not fit beside a chart"
 
 
 def test_numbers_that_are_not_known_are_no_numbers() -> None:

@@ -57,3 +57,29 @@ def test_info_shows_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.Monk
     assert "rotated by 70°, -50°, 104° on the IMU, and the IMU's clock" in told
     assert f"`run` and `serve` use this. To save it: hemislam calibrate {walk} --write" in told
     assert told.count("mount ") == 1 and "no pose of the LiDAR on the IMU is given" not in told, "it is said once"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--write"], "add --force"),
+        (["--plot", "none/residuals.svg"], "folder that exists"),
+        (["--plot", "walk.mcap"], "choose a .svg"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("app.calibration.calibrate.calibrate", lambda *_: pytest.fail("minutes of work are lost"))
+    Path("walk.params.yaml").write_text("sensor: {max_range: 40}\n")
+    done = CliRunner().invoke(cli, ["calibrate", "walk.mcap", *options])
+    assert done.exit_code == 2 and said in done.output
+
+
+def test_what_cannot_be_kept_can_be_passed_instead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rehearsed(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    Path("walk.params.yaml").mkdir()
+    done = CliRunner().invoke(cli, ["calibrate", "walk.mcap", "--write", "--plot", "residuals.svg"])
+    assert done.exit_code == 2 and "Is a directory" in done.output and "Instead, pass --set 'sensor." in done.output

@@ -36,6 +36,7 @@ def test_transport_by_rest(site: Site) -> None:
         {"action": "seek"},
         {"action": "speed", "factor": 0},
         {"action": "step", "frames": -1},
+        {"action": "step", "count": 5},
     ):
         assert post(**bad) == 422
 
@@ -159,6 +160,7 @@ def test_a_note_stays_with_its_frame(site: Site) -> None:
         assert time.monotonic() < deadline
     assert notes[-1] == {"frame": 9, "text": "the door opens"}
     assert httpx.post(site.url("/api/notes"), json={"text": ""}).status_code == 422
+    assert httpx.post(site.url("/api/notes"), json={"text": "a door", "frame": 3}).status_code == 422
     there = f"/api/notes/{len(notes) - 1}"
     assert httpx.put(site.url(there), json={"text": "it closes"}).status_code == 202
     while httpx.get(site.url("/api/state")).json()["notes"][-1:] != [{"frame": 9, "text": "it closes"}]:

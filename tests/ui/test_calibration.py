@@ -98,6 +98,22 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert page.sent[3:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart(), Calibrated("")]
 
 
+def test_it_can_be_stopped_and_what_was_applied_before_can_still_be_undone(page: Calibrating) -> None:
+    page.found(FoundMounting([], FOUND))
+    user_clicks(page.panel._apply)
+    page.draw(page.now)
+    user_clicks(page.panel._button)
+    process = page.process()
+    assert page.panel._stop.visible and page.panel._apply.disabled, "nothing is applied meanwhile"
+    user_clicks(page.panel._stop)
+    assert process.closed and not page.panel._stop.visible and not page.panel._progress.visible
+    page.draw(page.now)
+    assert not page.panel._button.disabled
+    assert page.panel._apply.label == "Undo" and page.panel._apply.visible and not page.panel._apply.disabled
+    user_clicks(page.panel._apply)
+    assert not sidecar(WALK).exists()
+
+
 WALK = Path("walk.mcap")
 GIVEN = with_preset(WALK)
 
@@ -121,6 +137,24 @@ def test_undoing_brings_a_file_back_that_somebody_wrote(page: Calibrating) -> No
     assert (sensor.rotation, sensor.max_range) == ((70.0, -50.0, 104.0), 40)
     user_clicks(page.panel._apply)
     assert sidecar(WALK).read_text() == mine
+
+
+def test_a_full_disk_loses_no_file_that_somebody_wrote(page: Calibrating, monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = "sensor:\n  max_range: 40\n"
+    sidecar(WALK).write_text(mine)
+    write_beside(WALK, FOUND)  # mine is only in the file .old now
+    kept = sidecar(WALK).read_text()
+    write_text = Path.write_text
+
+    def half(path: Path, text: str, **options: Any) -> int:
+        write_text(path, text[: len(text) // 2], **options)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", half)
+    page.found(FoundMounting([], FOUND))
+    user_clicks(page.panel._apply)
+    assert "No space left" in page.panel._html.content and page.panel._keep.visible
+    assert sidecar(WALK).read_text() == kept and Path("walk.params.yaml.old").read_text() == mine
 
 
 def test_what_cannot_be_kept_is_used_all_the_same_and_said(page: Calibrating) -> None:
