@@ -105,6 +105,8 @@ class Player:
         self._moment = None
         self._doubted = set()
         self._page.opened(session)
+        if session.feed.repeatable:
+            self._page.put(live=None)
         self._pacer.release()
         self._target = SeekTarget(0, -1) if session.frame < 0 else None
 

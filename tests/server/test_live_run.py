@@ -22,7 +22,7 @@ from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from app.server.keeping import AddNote
-from app.server.protocol import LIVE, Pause, Seek, Snapshot, StepFrame
+from app.server.protocol import LIVE, OpenRecording, Pause, Seek, Snapshot, StepFrame
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.loops.service import InlineLoops
@@ -239,6 +239,13 @@ def test_there_is_no_going_back_live_and_it_is_said(live: Live) -> None:
     paused = live.until(lambda s: not s.transport.playing)
     assert paused.transport.frame >= 10, "it stayed where it was, or went on"
     thread.join(PATIENCE_S)
+
+
+def test_a_recording_that_is_opened_after_a_live_session_is_not_live(live: Live) -> None:
+    live.until(lambda now: now.live is not None)
+    live.engine.send(OpenRecording(SAMPLE, None))
+    opened = live.until(lambda now: now.recording is not None and now.recording.path == SAMPLE)
+    assert opened.live is None, "the page would offer no timeline, no truth and no search for parameters"
 
 
 def test_paused_the_source_is_still_watched_and_its_end_is_said_and_survived(live: Live) -> None:
