@@ -1,6 +1,7 @@
 """`hemislam run`: a recording from end to end, without a browser."""
 
 import contextlib
+import shlex
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -145,7 +146,7 @@ def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration |
 
 
 def _saving(recording: Path) -> str:
-    return f"hemislam calibrate {recording} --write"
+    return f"hemislam calibrate {shlex.quote(str(recording))} --write"
 
 
 @contextlib.contextmanager

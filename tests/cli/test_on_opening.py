@@ -59,6 +59,14 @@ def test_info_shows_how_the_lidar_is_turned(walk: Path, monkeypatch: pytest.Monk
     assert told.count("mount ") == 1 and "no pose of the LiDAR on the IMU is given" not in told, "it is said once"
 
 
+def test_the_command_to_save_it_can_be_pasted(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rehearsed(monkeypatch)
+    mine = tmp_path / "my walk.mcap"
+    mine.symlink_to(walk)
+    told = CliRunner().invoke(cli, ["info", str(mine)]).output
+    assert f"hemislam calibrate '{mine}' --write" in told
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
