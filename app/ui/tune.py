@@ -20,6 +20,8 @@ from app.ui.viser_adapter import Bridge
 from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_button, show
 
 _PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
+_LEAST_S: Final = 5.0
+"""Of less, a search shows nothing."""
 _LABELLED: Final = "the labelled frames"
 _NONE: Final = "–"
 _TITLES: Final = {one.title: one.name for one in OBJECTIVES.values()}
@@ -114,7 +116,8 @@ class TunePanel:
                 f"{done} · {self._left(wanted)}" if self._runs else "The first trial runs with the parameters as given."
             )
         if not found.finished:
-            return f"{done} · stopped"
+            failed = bool(found.trials) and all(trial.error for trial in found.trials)
+            return f"{done} · stopped" + (f" · all failed: {found.trials[0].error}" if failed else "")
         return " ".join(
             (f"{done} · saved in {wanted.folder}", advice(found.trials, found.held_back, self._objectives()))
         )
@@ -180,7 +183,15 @@ class TunePanel:
             begin = round(max(first - 0.15, 0.0), 1)  # a scan before its end
             return begin, round(last - begin + 0.2, 1)
         length, here = _PARTS[self._part.value], snapshot.transport.stamp_ns or start_ns
-        return (round(max((here - start_ns) * 1e-9, 0.0), 1) if length is not None else 0.0), length
+        if length is None:
+            return 0.0, None
+        begin = round(max((here - start_ns) * 1e-9, 0.0), 1)
+        if (left := snapshot.recording.duration_s - begin) < _LEAST_S:
+            raise HemislamError(
+                f"Only {max(left, 0.0):.1f} s of the recording are left from here; go back to a part that shows the "
+                "trouble, or choose the whole recording."
+            )
+        return begin, length
 
     def _run(self) -> None:
         """Begin, or go on: a search finds the runs that were finished before."""

@@ -138,6 +138,22 @@ def test_what_cannot_be_measured_is_refused_in_a_sentence(tuning: Tuning) -> Non
     assert tuning.process is None and "needs true poses" in told[0]
 
 
+def test_a_search_does_not_begin_where_the_recording_ends(tuning: Tuning) -> None:
+    tuning.now = replace(OPEN, transport=Transport(frame=599, stamp_ns=60_900_000_000))
+    user_clicks(tuning.panel._start)
+    assert tuning.process is None and "Only 0.1 s of the recording are left" in told[0]
+    user_sets(tuning.panel._part, "the whole recording")
+    user_clicks(tuning.panel._start)
+    assert tuning.process.arguments[0].start_s == 0.0
+
+
+def test_why_every_trial_failed_stays_on_the_page(tuning: Tuning) -> None:
+    user_clicks(tuning.panel._start)
+    tuning.draw(Tried((Trial(0, {}, (None,), "no ground"), Trial(1, {}, (None,), "lost"))), "No trial gave a result.")
+    tuning.draw()
+    assert tuning.process is None and tuning.says("2 of 49 trials · stopped · all failed: no ground")
+
+
 def test_another_recording_ends_the_search_and_forgets_its_trials(tuning: Tuning) -> None:
     user_clicks(tuning.panel._start)
     process = tuning.process
