@@ -15,6 +15,23 @@ TextRows = list[tuple[int, list[str]]]
 """The number and the words of each line that is not empty; `#` begins a comment."""
 
 
+class _TwiceError(yaml.MarkedYAMLError):
+    """A name stands twice in one section."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that stands twice; YAML forbids it, and otherwise the first value would be lost."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in names:
+                    raise _TwiceError(problem=key.value, problem_mark=key.start_mark)
+                names.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(text: str, source: str, hint: str) -> Any:
     """The value of a YAML text; None if it is empty.
 
@@ -22,14 +39,17 @@ def read_yaml(text: str, source: str, hint: str) -> Any:
         source: file or other origin of the text. hint: how to write it, for the error message.
 
     Raises:
-        HemislamError: the text is not valid YAML.
+        HemislamError: the text is not valid YAML, or a name stands twice in one section of it.
     """
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _Loader)
+    except RecursionError:
+        raise HemislamError(f"{source} is nested too deeply; {hint}.") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f" in line {mark.line + 1}" if mark else ""
-        raise HemislamError(f"{source} is not valid YAML{line}; {hint}.") from None
+        twice = f", where `{error.problem}` stands a second time" if isinstance(error, _TwiceError) else ""
+        raise HemislamError(f"{source} is not valid YAML{line}{twice}; {hint}.") from None
 
 
 def read_assignments(texts: Iterable[str], option: str, example: str) -> dict[str, Any]:

@@ -136,6 +136,10 @@ def test_a_mistake_is_named_with_what_would_be_right(values: dict[str, Any], say
     ("text", "says"),
     [
         ("\nground: [", "mine.yaml is not valid YAML in line 2"),
+        ("ground: {alpha: 30}\nfilter: {}\nground: {sigma: 0.1}", "in line 3, where `ground` stands a second time"),
+        ("ground: {alpha: 30, alpha: 40}", "in line 1, where `alpha` stands a second time"),
+        ("? [1, 2]\n: 3", "mine.yaml is not valid YAML in line 1"),
+        ("[" * 5000, "mine.yaml is nested too deeply"),
         ("30", "mine.yaml: Parameters must be a mapping of sections, not int"),
         ("ground: 30", "section `ground` must hold `name: value` lines"),
         ("1: {alpha: 3}", "no section `1`"),
