@@ -84,9 +84,7 @@ def as_json(calibration: Calibration) -> dict[str, Any]:
 def check_beside(recording: Path) -> None:
     """Raises HemislamError if a person wrote the parameter file beside the recording."""
     if uncalibrated(recording) == (path := sidecar(recording)):
-        raise HemislamError(
-            f"You wrote {path} yourself; add --force to change these values in it (it is kept as .old)."
-        )
+        raise HemislamError(f"You wrote {path} yourself; add --force to change values in it (it is kept as .old).")
 
 
 def write_beside(recording: Path, found: Mapping[str, Any]) -> Path:

@@ -46,7 +46,7 @@ class EngineProgress:
         frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
         T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
         floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
-        lines, gyro: estimated errors of the scan lines and of the gyroscope. clock: offset of the IMU's, estimated.
+        lines, gyro, clock: estimated errors of the scan lines, of the gyroscope and of the IMU's clock.
         paused: the pause after which there is no keyframe yet; None: there is none.
         doubt: how far odometry may be off since the last keyframe.
     """
