@@ -9,7 +9,7 @@ from app.slam import channels, coast, ground, imu, keyframes, pause, start
 from app.slam.certainty import Certainty, Doubt
 from app.slam.clock import ClockOffset
 from app.slam.floor import Floor
-from app.slam.fusion import fuse
+from app.slam.fusion import NOT_REGISTERED, Fused, fuse
 from app.slam.gyroscope import GyroErrors
 from app.slam.imu import POS, Belief
 from app.slam.kernels import clouds
@@ -49,6 +49,7 @@ class EngineProgress:
         lines, gyro, clock: estimated errors of the scan lines, of the gyroscope and of the IMU's clock.
         paused: the pause after which there is no keyframe yet; None: there is none.
         doubt: how far odometry may be off since the last keyframe.
+        ride: while a rest is awaited, where scans see the device if it rides evenly instead; else None.
     """
 
     frame: int = 0
@@ -63,6 +64,7 @@ class EngineProgress:
     gyro: GyroErrors = field(default_factory=GyroErrors)
     paused: Interruption | None = None
     doubt: Doubt = field(default_factory=Doubt)
+    ride: Belief | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,8 @@ class _Begun:
 
     Attributes:
         belief: before the scan; while waiting, at its end. samples: those that lead from there to the scan's end.
-        still, waiting: as `start.Started`. floor, paused: as in `EngineProgress`. notice: for the user; "" if none.
+        still: as `start.Started`. floor, paused: as in `EngineProgress`. notice: for the user; "" if none.
+        ride: before the scan, as in `EngineProgress`; None unless a longer rest is awaited.
     """
 
     belief: Belief
@@ -89,8 +92,12 @@ class _Begun:
     floor: Floor | None
     paused: Interruption | None = None
     still: ImuSamples | None = None
-    waiting: bool = False
+    ride: Belief | None = None
     notice: str = ""
+
+    @property
+    def waiting(self) -> bool:
+        return self.ride is not None
 
 
 class Engine:
@@ -144,7 +151,10 @@ class Engine:
         watch.lap("downsample")
 
         # paper 2.3, eq. 5-7
-        fused = fuse(prediction, scan, points, sampled.points, reduced.source[sampled.source], self._map, p)
+        if begun.waiting:
+            fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled.points)
+        else:
+            fused = fuse(prediction, scan, points, sampled.points, reduced.source[sampled.source], self._map, p)
         status = FrameStatus.LOST if fused.lost else FrameStatus.TRACKING
         status = FrameStatus.INITIALISING if begun.waiting else status
         watch.lap("update")
@@ -162,8 +172,11 @@ class Engine:
         due = not (begun.waiting or settling) and (paused is not None or self._is_due(posterior))
         if due and status is FrameStatus.TRACKING and paused is None and p.filter.learn_lines:
             lines = self._learnt(lines, posterior, fused.points, scan.ring)
-        if not begun.waiting:
-            self._insert(posterior, fused.sampled, float(np.nan_to_num(fused.registration.residual_rms)))
+        ride = None
+        if begun.ride is not None:
+            ride = self._followed(begun.ride, scan, samples, clock.sigma)
+        else:
+            self._insert(posterior, fused)
         watch.lap("insert")
 
         cloud = _kept(fused.points, surface.labels, scan)
@@ -208,6 +221,7 @@ class Engine:
             gyro=gyro,
             paused=paused if settling else None,
             doubt=doubt if keyframe is None else replace(doubt, metres=0.0),
+            ride=ride,
         )
         return result
 
@@ -256,13 +270,27 @@ class Engine:
             )
             return _Begun(belief, samples, None, paused, notice=notice)
         if not len(samples):
+            self._map.clear()  # of what was seen while a rest was awaited
             notice = "There is no IMU: motion is estimated from the LiDAR alone, less accurately."
             return _Begun(coast.begin(scan, p), samples, before.floor, notice=notice)
-        started = start.proceed(before.still, scan, samples, p)
-        waiting = started.waiting and imu.longest_gap(samples, end_ns) <= p.imu.max_gap
-        return _Begun(
-            started.belief, samples, before.floor, still=started.still, waiting=waiting, notice=started.notice
-        )
+        started, ride = start.proceed(before.still, scan, samples, p), before.ride
+        if started.waiting and imu.longest_gap(samples, end_ns) <= p.imu.max_gap:
+            ride = ride or start.moving(started.still, max(scan.stamp_ns, int(started.still.stamps_ns[0])), p)
+            return _Begun(started.belief, samples, before.floor, still=started.still, ride=ride)
+        if ride is not None and start.has_ridden(ride, started.belief):
+            return _Begun(ride, samples, before.floor, notice=start.RIDING)
+        self._map.clear()  # of what was seen while a rest was awaited
+        return _Begun(started.belief, samples, before.floor, notice=started.notice)
+
+    def _followed(self, ride: Belief, scan: Scan, samples: ImuSamples, clock_sigma: float) -> Belief:
+        """Where scans see the device at the scan's end, in case it does not rest although its IMU feels so."""
+        p = self.params
+        prediction = predict(ride, samples, scan.end_ns, p.imu, clock_sigma)
+        points = prediction.deskew(scan)
+        sampled = self._grid.downsample(points, p.scan.voxel_size)
+        fused = fuse(prediction, scan, points, sampled.points, sampled.source, self._map, p)
+        self._insert(fused.belief, fused)
+        return fused.belief
 
     def _is_due(self, belief: Belief) -> bool:
         return keyframes.is_due(self._progress.T_odom_keyframe, belief.state.T_odom_imu, self.params.keyframe)
@@ -275,7 +303,8 @@ class Engine:
         walked = float(np.linalg.norm(belief.state.p_odom_imu - last[:3, 3]))
         return lines.learnt(belief, points, rings, walked, self._map, self.params.filter)
 
-    def _insert(self, belief: Belief, points: F32, residual: float) -> None:
+    def _insert(self, belief: Belief, fused: Fused) -> None:
+        points, residual = fused.sampled, float(np.nan_to_num(fused.registration.residual_rms))
         T = belief.state.T_odom_lidar.astype(np.float32)
         self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
 

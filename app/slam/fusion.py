@@ -20,7 +20,7 @@ from app.slam.prediction import Prediction
 from app.slam.types import F32, I32, Registration, Scan
 from app.slam.voxel import spread
 
-_NOT_REGISTERED = Registration(
+NOT_REGISTERED = Registration(
     False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
 )
 
@@ -50,7 +50,7 @@ def fuse(
         sampled: (m, 3) m, the same, thinned. source: (m,) which points of the scan these are nearest to.
     """
     if not local_map.voxels:
-        fused = Fused(prediction.belief, _NOT_REGISTERED, points, sampled)
+        fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled)
     elif prediction.course is None:
         fused = Fused(*_with_imu(prediction, sampled, local_map, params), points, sampled)
     else:
@@ -97,4 +97,4 @@ def _attempted(predicted: Belief, update: Callable[[], tuple[Belief, Registratio
         posterior, registration = update()
         if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():
             return posterior, registration
-    return predicted, replace(_NOT_REGISTERED, reason="the update gave no finite pose")
+    return predicted, replace(NOT_REGISTERED, reason="the update gave no finite pose")

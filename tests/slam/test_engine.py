@@ -15,6 +15,7 @@ from tests.slam.engine_runs import ALONG, FRAMES, REAL, assert_all_same, assert_
 from tests.slam.scenes import (
     FORWARD,
     UPRIGHT,
+    YARD,
     Rig,
     Scene,
     Walk,
@@ -26,6 +27,8 @@ from tests.slam.scenes import (
     pose_error,
     seconds_of,
 )
+
+STEADY = ((0.0, 1.0, 0.0),) * 3
 
 
 # --- walks ---------------------------------------------------------------------------------------
@@ -105,6 +108,24 @@ def test_a_start_in_motion_is_reported_and_survived() -> None:
     metres, degrees = worst(settled, walk)
     assert metres < 0.05
     assert degrees < 1.0
+
+
+@pytest.mark.parametrize("yaw_rate", [0.0, 0.1])
+def test_a_device_that_rides_evenly_is_not_taken_for_one_at_rest(yaw_rate: float) -> None:
+    """On a trolley the IMU feels nothing, a turn passes for a bias, and only the scans tell."""
+    for scene, speed in ((furnished_room(), 0.5), (YARD, 1.2)):
+        ride = Walk(still=-4.0, speed=(speed, 0.0, 0.0), sway=STEADY, turn=STEADY, yaw_rate=yaw_rate)
+        results = run(Engine(params_for(REAL)), measurements(scene, ride, REAL, 40))
+        assert "moving evenly" in " ".join(n for r in results for n in r.notices)
+        metres, degrees = worst(results, ride)
+        assert metres < 0.05
+        assert degrees < 1.0
+
+
+def test_a_rest_is_one_also_where_scans_leave_the_way_along_a_corridor_open() -> None:
+    results = run(Engine(params_for(REAL)), measurements(corridor(300.0, pillars=False), Walk(still=100.0), REAL, 20))
+    assert not any(r.notices for r in results)
+    assert worst(results, Walk(still=100.0))[0] < 0.01
 
 
 def test_extrinsics_are_found_when_they_are_estimated() -> None:
