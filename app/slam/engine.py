@@ -160,7 +160,8 @@ class Engine:
         watch.lap("update")
 
         posterior, paused = fused.belief, begun.paused
-        if status is FrameStatus.TRACKING and fused.registration.inliers and prediction.covered:
+        believed = prediction.covered and not fused.imu_wrong
+        if status is FrameStatus.TRACKING and fused.registration.inliers and believed:
             if p.imu.learn_clock:
                 clock = clock.learnt(begun.samples, predicted, posterior.state)
             if p.imu.learn_scale:

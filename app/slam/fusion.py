@@ -31,6 +31,7 @@ class Fused:
     belief: at the scan's end. registration: how it went.
     points: (n, 3) m, the scan, deskewed. sampled: (m, 3) m, those that enter the map; both in the LiDAR frame.
     lost: whether the pose is a guess: the scan met too few planes, or nothing measures the speed any more.
+    imu_wrong: whether the scan shows that the IMU was wrong about how the device moved during it.
     """
 
     belief: Belief
@@ -38,6 +39,12 @@ class Fused:
     points: F32
     sampled: F32
     lost: bool = False
+    imu_wrong: bool = False
+
+
+BETTER, SAME_PART = 0.5, 0.9
+"""A scan that contradicts the IMU, and without it fits the map with at most this share of the residuals and at least
+this share of the points, shows that the IMU was wrong about the whole scan: it was knocked, or froze."""
 
 
 def fuse(
@@ -53,6 +60,8 @@ def fuse(
         fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled)
     elif prediction.course is None:
         fused = Fused(*_with_imu(prediction, sampled, local_map, params), points, sampled)
+        if fused.registration.surprise > iekf.SURPRISING and prediction.evenly is not None:
+            fused = _better(fused, prediction.evenly(), scan, source, local_map, params)
     else:
         fused = _by_scan(prediction, prediction.course, scan, source, local_map, params)
     belief = imu.after_gap(fused.belief, prediction.begin) if prediction.gap else fused.belief
@@ -89,6 +98,19 @@ def _by_scan(
         why = "there is no IMU" if prediction.path is None else "the IMU is silent"
         registration = replace(registration, reason=f"{registration.reason}, and {why}")
     return Fused(posterior, registration, points, points[source], lost=adrift)
+
+
+def _better(fused: Fused, even: Prediction, scan: Scan, source: I32, local_map: LocalMap, params: Params) -> Fused:
+    """The scan fused without the IMU's word on how it bent the scan, if it then fits the map much better."""
+    assert even.course is not None
+    again = _by_scan(even, even.course, scan, source, local_map, params)
+    first, second = fused.registration, again.registration
+    worse = second.inliers * first.used < SAME_PART * first.inliers * second.used
+    if again.lost or worse or not second.residual_rms < BETTER * first.residual_rms:
+        return fused
+    told = {name: getattr(first, name) for name in ("predicted_change", "correction", "surprise")}
+    belief = imu.after_gap(again.belief, even.begin)
+    return replace(again, belief=belief, registration=replace(second, **told), imu_wrong=True)
 
 
 def _attempted(predicted: Belief, update: Callable[[], tuple[Belief, Registration]]) -> tuple[Belief, Registration]:

@@ -1,6 +1,10 @@
 """Where the device is expected at a scan's end, before the scan is compared with the map."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
 
 from app.slam import coast, imu, rest
 from app.slam.coast import Course
@@ -15,6 +19,7 @@ class Prediction:
     begin: the belief from which it was made. belief: the one at the scan's end.
     path: by the IMU in between; None without samples. gap: whether the samples have one.
     course: set if the scan itself has to tell how the device moved; None if the IMU tells it.
+    evenly: makes the prediction to use if the scan shows that the IMU was wrong; None unless the IMU tells the course.
     """
 
     begin: Belief
@@ -22,6 +27,7 @@ class Prediction:
     path: Path | None
     gap: bool
     course: Course | None
+    evenly: "Callable[[], Prediction] | None" = None
 
     @property
     def covered(self) -> bool:
@@ -49,4 +55,13 @@ def predict(belief: Belief, samples: ImuSamples, end_ns: int, params: ImuParams,
     predicted, path = imu.propagate(imu.before_gap(belief) if gap else belief, samples, end_ns, params, clock_sigma)
     if gap or coast.is_unsure(predicted):
         return Prediction(belief, predicted, path, gap, Course.measured(path, predicted.state))
-    return Prediction(belief, rest.hold(predicted, samples), path, gap, None)
+    evenly = partial(_evenly, belief, samples, end_ns, params, clock_sigma)
+    return Prediction(belief, rest.hold(predicted, samples), path, gap, None, evenly)
+
+
+def _evenly(belief: Belief, samples: ImuSamples, end_ns: int, params: ImuParams, clock_sigma: float) -> Prediction:
+    """As `predict`, but at the median of the samples' rates, and as if there were a gap."""
+    gyro, accel = (np.tile(np.median(values, axis=0), (2, 1)) for values in (samples.gyro, samples.accel))
+    steady = ImuSamples(samples.stamps_ns[[0, -1]], gyro, accel)
+    predicted, path = imu.propagate(imu.before_gap(belief), steady, end_ns, params, clock_sigma)
+    return Prediction(belief, predicted, path, True, Course.measured(path, predicted.state))

@@ -163,6 +163,21 @@ def test_a_speed_or_tilt_that_went_wrong_is_found_again(change: Callable[[NavSta
     assert metres < 0.3
 
 
+def test_a_scan_that_a_wrong_imu_has_bent_is_set_straight_by_itself() -> None:
+    """The device hits a door frame, and for 30 ms its IMU measures far more than there was."""
+
+    def knocked(m: Measurement) -> Measurement:
+        during = np.abs((m.imu.stamps_ns - START_NS) * 1e-9 - 4.015) < 0.015
+        gyro = m.imu.gyro + np.outer(during, [2.0, 1.0, -2.0])
+        return replace(m, imu=replace(m.imu, gyro=gyro, accel=m.imu.accel + np.outer(during, [40.0, 20.0, -30.0])))
+
+    results = run(Engine(params_for(REAL)), map(knocked, room_walk(70)))
+    assert max(r.registration.surprise for r in results[38:42]) > iekf.SURPRISING  # told as a contradiction
+    metres, degrees = worst(results, Walk())
+    assert metres < 0.015
+    assert degrees < 0.5
+
+
 @pytest.mark.parametrize("begin_s", [0.35, 2.02, 4.02])
 def test_an_imu_that_stops_for_good_leaves_the_walk_to_the_scans(begin_s: float) -> None:
     """It stops while the device still rests for the start, at the first steps, or amid the walk."""
