@@ -8,7 +8,7 @@ takes effect: `now` (the current frame is segmented again at once), `frame` (fro
 from functools import partial
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 from pydantic.config import JsonDict
 
 Effect = Literal["now", "frame", "restart"]
@@ -49,6 +49,16 @@ class Section(BaseModel):
         """Refuse text that UTF-8 cannot encode: JSON can hold half of a surrogate pair."""
         if isinstance(value, str):
             value.encode()
+        return value
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _is_no_switch(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse true and false for a number: YAML reads `yes` and `no` as these, and Python these as 1 and 0."""
+        parts = value if isinstance(value, list | tuple) else (value,)
+        is_switch = isinstance(cls.model_fields[str(info.field_name)].default, bool)
+        if not is_switch and any(isinstance(part, bool) for part in parts):
+            raise ValueError("true and false are no numbers")
         return value
 
     @classmethod

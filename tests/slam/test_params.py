@@ -120,6 +120,9 @@ def test_both_ends_of_a_range_belong_to_it(leaf: Leaf) -> None:
         ({"recording.time_unit": "min"}, "one of auto, s, ms, us, ns"),
         ({"ground.scan_lines": 3.5}, "a whole number from 1 to 128"),
         ({"ground.enabled": "perhaps"}, "true or false"),
+        ({"ground.alpha": True}, "`ground.alpha` cannot be True: it must be a number"),  # YAML reads `yes` as true
+        ({"ground.scan_lines": False}, "cannot be False: it must be a whole number"),
+        ({"sensor.translation": [0.1, True, 0.2]}, "it must be 3 numbers"),
         ({"sensor.translation": [1, 2]}, "cannot be [1, 2]: it must be 3 numbers from -100 to 100 m"),
         ({"recording.imu_topic": 5}, "a text"),
         ({"recording.imu_time_offset": float("nan")}, "a number from -4e+09 to 4e+09 s"),
