@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import Duration, Imperfect, ParamsFor, Short, Suite, with_params
+from app.cli.options import MOST_S, Duration, Imperfect, ParamsFor, Short, Suite, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
 from app.slam.text_files import make_folder
@@ -38,6 +38,7 @@ PartStart = Annotated[
     typer.Option(
         "--start",
         min=0,
+        max=MOST_S,
         metavar="SECONDS",
         help="Measure from this time after the first scan on; every system starts 5 s earlier.",
     ),

@@ -30,11 +30,14 @@ LidarTopic = Annotated[
     str | None, typer.Option("--lidar-topic", metavar="TOPIC", help="Point clouds; else the first of type PointCloud2.")
 ]
 ImuTopic = Annotated[str | None, typer.Option("--imu-topic", metavar="TOPIC", help="IMU; else the first of type Imu.")]
+MOST_S = 1e9
+"""Of a start or a duration; nanoseconds of far more do not fit into 64 bits."""
 Start = Annotated[
-    float, typer.Option("--start", min=0, metavar="SECONDS", help="Begin this long after the first scan.")
+    float, typer.Option("--start", min=0, max=MOST_S, metavar="SECONDS", help="Begin this long after the first scan.")
 ]
 Duration = Annotated[
-    float | None, typer.Option("--duration", min=0, metavar="SECONDS", help="Process only this much of the recording.")
+    float | None,
+    typer.Option("--duration", min=0, max=MOST_S, metavar="SECONDS", help="Process only this much of the recording."),
 ]
 RunFolder = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else runs/NAME-1, -2, ...")

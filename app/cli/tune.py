@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from app.cli.evaluate import ClusterAddress, ClusterData, Jobs, Out, PartStart, Truths, read_subjects, runner
-from app.cli.options import Duration, ParamsFor, with_params
+from app.cli.options import MOST_S, Duration, ParamsFor, with_params
 from app.slam.errors import HemislamError
 from app.slam.text_files import make_folder
 
@@ -43,6 +43,7 @@ def tune(
         typer.Option(
             "--held-back",
             min=0,
+            max=MOST_S,
             metavar="SECONDS",
             help="Length of the part after --duration on which the best setting is checked. Default: as long; 0: none.",
         ),

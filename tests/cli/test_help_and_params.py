@@ -96,6 +96,15 @@ def test_an_option_that_would_be_ignored_is_refused(hemislam: Call, arguments: l
     assert says in hemislam(*arguments).refused()
 
 
+@pytest.mark.parametrize("command", ["run", "evaluate", "tune"])
+@pytest.mark.parametrize("value", ["inf", "1e300"])
+def test_a_start_that_no_clock_can_count_is_refused(hemislam: Call, walk: Path, command: str, value: str) -> None:
+    """walk: it exists, so nothing else is wrong."""
+    assert "--start" in hemislam(command, walk, "--start", value).err
+    assert hemislam(command, walk, "--start", value).code == 2
+    assert hemislam(command, walk, "--duration", value).code == 2
+
+
 def test_simulate_keeps_a_file_that_is_there_and_names_the_scenes(hemislam: Call, tmp_path: Path) -> None:
     there = tmp_path / "walk.mcap"
     there.write_bytes(b"mine")
