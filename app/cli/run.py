@@ -1,7 +1,6 @@
 """`hemislam run`: a recording from end to end, without a browser."""
 
 import contextlib
-import shlex
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,7 @@ from app.cli.options import (
     say_calibrated,
     with_params,
 )
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, quoted
 
 if TYPE_CHECKING:
     from app.calibration.calibrate import Calibration
@@ -146,7 +145,7 @@ def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration |
 
 
 def _saving(recording: Path) -> str:
-    return f"hemislam calibrate {shlex.quote(str(recording))} --write"
+    return f"hemislam calibrate {quoted(recording)} --write"
 
 
 @contextlib.contextmanager

@@ -32,13 +32,11 @@ from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_type
 from app.sensors.rings import line_findings
 from app.sensors.ros import imu_values, stamp_ns
 from app.sensors.sequencer import Sequencer
-from app.sensors.source import Mark, Source
+from app.sensors.source import LOG_MARGIN_NS, Mark, Source
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan, Vector
 
-LOG_MARGIN_NS = 2_000_000_000
-"""A message logged this much later or earlier than usual is still found by its time."""
 SILENCE_S = 0.5
 """A gap without scans at the end, while the IMU goes on, is reported if it is longer than this."""
 NO_IMU = Finding(
@@ -106,6 +104,7 @@ class Recording(AbstractContextManager["Recording"]):
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
         probes, scans = self._decode_probes(probes, cloud_findings)
         self._look_at_clocks()
+        source.first_scan_ns = probes[0].log_ns
         self.start_ns = scans[0].stamp_ns + added_ns(self._leaps.lidar, probes[0].log_ns)
         log_start_ns = int(self.log_times(np.array([probes[0].log_ns]))[0])
         self._log_after_stamp_ns = log_start_ns - self.start_ns

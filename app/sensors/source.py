@@ -20,7 +20,7 @@ from app.sensors.mcap_stream import SET_BACK_NS, McapStream
 from app.sensors.ouster import OusterStream, metadata_beside
 from app.sensors.ros import Deserialiser
 from app.sensors.unpacking import limit_rosbags
-from app.slam.errors import HemislamError, printable
+from app.slam.errors import HemislamError, printable, quoted
 
 _COMPRESSED = (".zst", ".zstd")
 SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
@@ -34,6 +34,8 @@ _REPAIR = {
 }
 _KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap, a .db3, or a .pcap of an RS-Bpearl, an Airy, a Mid-360 or an Ouster"
 _FOREVER = 2**63 - 1
+LOG_MARGIN_NS = 2_000_000_000
+"""A message logged this much later or earlier than usual is still found by its time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +131,7 @@ class Source(AbstractContextManager["Source"]):
     Attributes:
         path: as given. topics: by name. start_ns, end_ns: log times of the first and last message.
         findings: what is unusual about the file and was overcome.
+        first_scan_ns: log time from which `--duration` counts; the first message's until a reader knows better.
     """
 
     def __init__(self, path: Path) -> None:
@@ -140,6 +143,7 @@ class Source(AbstractContextManager["Source"]):
         self.path = path
         self._stream, self.findings = _open(path)
         self.start_ns, self.end_ns = self._stream.start_ns, self._stream.end_ns
+        self.first_scan_ns = self.start_ns
         self.topics = tuple(Topic(name, *content) for name, content in sorted(self._stream.counts.items()))
         if not any(topic.messages for topic in self.topics):
             self.close()
@@ -172,9 +176,10 @@ class Source(AbstractContextManager["Source"]):
             except Exception as error:  # rosbags lets those of zstd, lz4, sqlite, struct and asserts through
                 at = (log_ns - self.start_ns) / 1e9
                 advice = _repair(self.path)
-                if at > 1:
+                usable = (log_ns - self.first_scan_ns - LOG_MARGIN_NS) / 1e9 - 0.5
+                if usable > 1:
                     advice = (
-                        f"what comes before can be used (start hemislam with --duration {at - 0.5:.1f}), and {advice}"
+                        f"what comes before can be used (start hemislam with --duration {usable:.1f}), and {advice}"
                     )
                 raise HemislamError(
                     f"{self.path} is damaged {at:.1f} s after its start ({_brief(error)}); {advice}."
@@ -212,7 +217,7 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         database = str(unmerged[0]).removesuffix("-wal")
         text = (
             f"{unmerged[0].name} holds messages that are not yet in the database and are not read, as after a recorder "
-            f"that was killed; `sqlite3 {database} 'PRAGMA wal_checkpoint(TRUNCATE)'` moves them there"
+            f"that was killed; `sqlite3 {quoted(Path(database))} 'PRAGMA wal_checkpoint(TRUNCATE)'` moves them there"
         )
         return reader, (Finding("file", "needs you", text),)
     if path.is_dir() and files != [path]:
@@ -282,7 +287,7 @@ def _refusal(path: Path, error: Exception) -> str:
     if isinstance(error, PermissionError):
         return f"{path} cannot be opened (permission denied); change its permissions or copy it."
     if path.is_dir() and "metadata" in brief.lower():
-        return f"The metadata.yaml of {path} cannot be understood; {_REPAIR[''].format(path=path)}."
+        return f"The metadata.yaml of {path} cannot be understood; {_REPAIR[''].format(path=quoted(path))}."
     if "not indexed" in brief:
         return f"{path} has no index, as after a recorder that was killed; {_repair(path)}."
     return f"{path} is cut off or damaged ({brief}); {_repair(path)}."
@@ -296,16 +301,16 @@ def _recording_files(path: Path) -> list[Path]:
         if path.is_dir():
             return _folder_files(path)
         if path.suffix.lower() == ".osf":
-            pcap = path.with_suffix(".pcap")
-            raise HemislamError(f"{path} is read by Ouster's own tool only; `ouster-cli source {path} save {pcap}`.")
+            convert = f"ouster-cli source {quoted(path)} save {quoted(path.with_suffix('.pcap'))}"
+            raise HemislamError(f"{path} is read by Ouster's own tool only; `{convert}`.")
         if path.suffix.lower() in _COMPRESSED:
             whole = (path.parent / "metadata.yaml").is_file()
-            advice = f"open its folder {path.parent}" if whole else f"`unzstd {path}` unpacks it"
+            advice = f"open its folder {path.parent}" if whole else f"`unzstd {quoted(path)}` unpacks it"
             raise HemislamError(f"{path} is compressed as a whole file; {advice}.")
         if path.name.endswith(".bag.active"):
             raise HemislamError(
-                f"{path} was left by a recorder that was killed; `rosbag reindex {path}` repairs it, then rename it to "
-                f"{path.stem}."
+                f"{path} was left by a recorder that was killed; `rosbag reindex {quoted(path)}` repairs it, then "
+                f"rename it to {path.stem}."
             )
         if path.suffix.lower() not in SUFFIXES:
             raise HemislamError(f"{path} does not look like a recording; hemislam reads {_KINDS}.")
@@ -340,7 +345,7 @@ def _folder_files(path: Path) -> list[Path]:
     if bags:
         hint = f"its .bag files are not numbered as pieces of one: open one of them, such as {bags[0].name}"
     elif compressed := sorted(file for file in path.iterdir() if file.suffix in _COMPRESSED):
-        hint = f"copy its metadata.yaml too, or unpack its files, as by `unzstd {compressed[0]}`"
+        hint = f"copy its metadata.yaml too, or unpack its files, as by `unzstd {quoted(compressed[0])}`"
     raise HemislamError(f"The folder {path} is not a ROS 2 recording (it has neither metadata.yaml nor .mcap); {hint}.")
 
 
@@ -362,8 +367,8 @@ def _repair(path: Path) -> str:
         if len(inside) == 1:
             path = inside[0]
         elif {file.suffix for file in inside} == {".bag"}:
-            path /= "*.bag"
-    return _REPAIR["" if path.is_dir() else path.suffix.lower()].format(path=path)
+            return _REPAIR[".bag"].format(path=f"{quoted(path)}/*.bag")
+    return _REPAIR["" if path.is_dir() else path.suffix.lower()].format(path=quoted(path))
 
 
 def _brief(error: BaseException) -> str:

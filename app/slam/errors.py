@@ -1,5 +1,8 @@
 """The one error that users read."""
 
+import shlex
+from pathlib import Path
+
 LONGEST = 2000
 
 
@@ -8,6 +11,11 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
+def quoted(path: Path) -> str:
+    """A path as a shell takes it, for a command in a message."""
+    return shlex.quote(str(path))
 
 
 class HemislamError(Exception):

@@ -30,7 +30,7 @@ from app.sensors.live.msop import other_sensor
 from app.sensors.live.pcap import Capture, CapturePlace, Datagram
 from app.sensors.live.status import Counters
 from app.sensors.robosense import Model
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, quoted
 from app.slam.types import I64, Scan
 
 SUFFIXES = (".pcap", ".pcapng")
@@ -148,7 +148,7 @@ class PacketStream(ABC):
         text = (
             f"{1 + len(self._other_senders)} LiDARs send in this capture; only {used} is read, and {left_out} left "
             "out. A .json or .angles.csv beside the file must belong to the LiDAR that is read. To read another, "
-            f"remove this one: `tcpdump -r {self._path} -w other.pcap not src host {used}`"
+            f"remove this one: `tcpdump -r {quoted(self._path)} -w other.pcap not src host {used}`"
         )
         return [Finding("LiDARs", "needs you", text)]
 
