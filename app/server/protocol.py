@@ -303,7 +303,8 @@ class Snapshot(Kept):
         params: as chosen. pending_restart: names of those that take effect on restart only.
         result: of the newest frame, with the present ground parameters and without its `keyframe`.
         chunks: of all keyframes up to the frame. keyframe_poses: (k, 4, 4) T_map_imu.
-        trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops.
+        trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops and by
+            `adjustment`, which levels or georeferences the map.
         series: (n,) arrays by SERIES name.
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
         notices: the newest 50. saved: the newest 10.
@@ -323,6 +324,7 @@ class Snapshot(Kept):
     keyframe_poses: F64 = field(default_factory=lambda: _NO_POSES)
     trajectory: F64 = field(default_factory=lambda: _NO_POSITIONS)
     corrections: MapFrame = field(default_factory=MapFrame)
+    adjustment: MapFrame = field(default_factory=MapFrame)
     loops: LoopsView = LoopsView()
     series: dict[str, F64] = field(default_factory=dict)
     T_map_truth: F64 | None = None

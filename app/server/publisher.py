@@ -104,7 +104,8 @@ class Publisher:
         else:
             self._session += 1
             self._cursor, self._chunks = Cursor(), 0
-        self.put(urgent=True, session=self._session, result=None, corrections=MapFrame(), loops=LoopsView())
+        none = MapFrame()
+        self.put(urgent=True, session=self._session, result=None, corrections=none, adjustment=none, loops=LoopsView())
 
     @property
     def filled(self) -> bool:
@@ -179,7 +180,7 @@ class Publisher:
         """Show the corrections by loops and fixes, if they have changed."""
         if session.shown_frame is not self._corrections:
             self._corrections = session.shown_frame
-            self.put(corrections=self._corrections)
+            self.put(corrections=self._corrections, adjustment=session.adjustment)
 
     def relabelled(self, result: StepResult) -> None:
         """Show other labels of the frame."""

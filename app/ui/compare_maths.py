@@ -44,8 +44,8 @@ class Difference:
     """Of the frames that both runs have, from the fork on.
 
     Attributes:
-        stamps_s: since the start of the recording. position_m: between the positions in the map; both
-            start at the same pose, so nothing is aligned. turn_deg: between the orientations in odom.
+        stamps_s: since the start of the recording. position_m: between the positions before the maps were levelled;
+            both start at the same pose, so nothing is aligned. turn_deg: between the orientations in odom.
         total_ms, error_m: of A and of B; the error is nan without truth.
     """
 
@@ -74,11 +74,17 @@ def difference(a: Snapshot, b: Snapshot, since: int) -> Difference:
     in_a = in_a + max(since, 0)
     return Difference(
         stamps_s=a.series["stamp_s"][in_a],
-        position_m=np.linalg.norm(a.trajectory[in_a] - b.trajectory[in_b], axis=1),
+        position_m=np.linalg.norm(_positions(a)[in_a] - _positions(b)[in_b], axis=1),
         turn_deg=turn(_turns(a)[in_a], _turns(b)[in_b]),
         total_ms=(a.series["total_ms"][in_a], b.series["total_ms"][in_b]),
         error_m=(a.series["error_m"][in_a], b.series["error_m"][in_b]),
     )
+
+
+def _positions(snapshot: Snapshot) -> F64:
+    """(n, 3) m, where it was before one turn levelled the whole map, as happens to the run that ends first."""
+    turns = snapshot.adjustment.T_map_odom
+    return lie.moved(lie.inverse(turns[0]), snapshot.trajectory) if len(turns) == 1 else snapshot.trajectory
 
 
 def _turns(snapshot: Snapshot) -> F64:

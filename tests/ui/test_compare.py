@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from app.server.folders import Folders
 from app.server.fork import Workspace
-from app.server.protocol import Notice, Progress, Saved, Seek, SetParams, StepFrame
+from app.server.protocol import Notice, Progress, Saved, Seek, SetParams, Snapshot, StepFrame
+from app.slam.map_frame import MapFrame
 from app.slam.types import GROUND, NON_GROUND, SEED, Cloud
 from app.ui.compare_maths import (
     A_COLOUR,
@@ -23,6 +24,7 @@ from app.ui.compare_maths import (
     COLUMNS,
     Labelled,
     common_frames,
+    difference,
     ground_difference,
     how,
     thinned,
@@ -51,6 +53,17 @@ def test_an_angle_between_orientations_is_that_of_scipy() -> None:
     np.testing.assert_allclose(turn(*vectors), np.degrees((a.inv() * b).magnitude()), atol=1e-9)
     vectors[0][3] = np.nan
     assert np.flatnonzero(np.isnan(turn(*vectors))).tolist() == [3]
+
+
+def test_a_run_that_is_levelled_since_it_has_ended_does_not_lie_apart_from_one_that_goes_on() -> None:
+    """As B, forked where A went back to: the same poses, of which A's are turned about the map's origin."""
+    stamps, walked = 0.1 * np.arange(50), np.random.default_rng(1).uniform(-30, 30, (50, 3))
+    turns = {f"turn_{axis}": np.zeros(50) for axis in "xyz"}
+    b = Snapshot(trajectory=walked, series={"stamp_s": stamps, "total_ms": stamps, "error_m": stamps, **turns})
+    level = MapFrame.levelling(np.array([0.05, -0.03, -9.8]))
+    a = replace(b, trajectory=walked @ level.newest[:3, :3].T, adjustment=level)
+    assert np.linalg.norm(a.trajectory - b.trajectory, axis=1).max() > 0.1
+    assert difference(a, b, since=20).position_m == pytest.approx(np.zeros(30), abs=1e-9)
 
 
 def cloud(labels: list[int], offsets: list[int]) -> Cloud:
