@@ -299,7 +299,7 @@ def _save(engine: RunningEngine, folder: Path, formats: tuple[str, ...]) -> None
     snapshot = engine.snapshot
     if snapshot.transport.frame < 0:
         raise HTTPException(409, "No frame has been processed yet; open a recording and play it first.")
-    _send(engine, protocol.Save(folder, formats))
+    _send(engine, protocol.Save(folder, formats, fetched=True))
     deadline = time.monotonic() + EXPORT_TIMEOUT_S
     while time.monotonic() < deadline:
         for saved in snapshot.saved:

@@ -119,11 +119,13 @@ class Save(Command, frozen=True):
 
     Attributes:
         formats: as `hemislam export` has them; none: all files of a run. choice: of points, as there.
+        fetched: the sender takes the files from there at once and removes the folder; the page says nothing of it.
     """
 
     folder: Path
     formats: tuple[str, ...] = ()
     choice: Choice = EVERYTHING
+    fetched: bool = False
 
 
 class EditLabels(Command, frozen=True):
@@ -237,10 +239,11 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Saved:
-    """A `Save` that has ended. error: why it failed; "" if it did not."""
+    """A `Save` that has ended. error: why it failed; "" if it did not. fetched: as in `Save`."""
 
     folder: Path
     error: str = ""
+    fetched: bool = False
 
 
 @dataclass(frozen=True, slots=True)

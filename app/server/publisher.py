@@ -195,4 +195,5 @@ class Publisher:
     def saved(self, saved: Saved) -> None:
         self._saved = (*self._saved, saved)[-SAVED_KEPT:]
         self.put(saved=self._saved, urgent=True)
-        self.notice("error" if saved.error else "info", saved.error or f"Saved in {saved.folder}.")
+        if not saved.fetched:
+            self.notice("error" if saved.error else "info", saved.error or f"Saved in {saved.folder}.")

@@ -58,8 +58,8 @@ def result_folder_name(recording: Path, now: datetime) -> str:
 
 
 def last_saved(snapshot: Snapshot) -> Path | None:
-    """The folder of the results that were saved last."""
-    return next((saved.folder for saved in reversed(snapshot.saved) if not saved.error), None)
+    """The folder of the results that were saved last, and stay."""
+    return next((one.folder for one in reversed(snapshot.saved) if not (one.error or one.fetched)), None)
 
 
 def folder_name(typed: str) -> str:

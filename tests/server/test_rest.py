@@ -67,6 +67,7 @@ def test_exports_by_rest(site: Site) -> None:
     assert len(trajectory) == 21 and all(len(line.split()) == 8 for line in trajectory)
     cloud = httpx.get(site.url("/api/export/map.ply"), timeout=TIMEOUT_S).content
     assert f"element vertex {5 * fakes.POINTS:012d}".encode() in cloud
+    assert not [text for text in notices(site) if "hemislam-export" in text], "the folder is gone already"
     assert httpx.get(site.url("/api/export/passwd")).status_code == 422
     for name in ("trajectory.gpx", "map.kmz"):
         refused = httpx.get(site.url(f"/api/export/{name}"))

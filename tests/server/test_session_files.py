@@ -33,6 +33,7 @@ from app.server.protocol import (
 )
 from app.slam.params import Params
 from app.slam.trajectory import Trajectory, write_tum
+from app.ui.files import last_saved
 
 
 # --- recordings ----------------------------------------------------------------------------------
@@ -146,6 +147,21 @@ def test_a_session_is_reopened_with_its_speed_and_breakpoints(tmp_path: Path) ->
     again = Bench(str(snapshot.session_file)).see()
     assert (again.breakpoints, again.transport.speed, again.transport.frame) == (chosen, math.inf, 30)
     assert not again.transport.playing
+
+
+def test_what_a_script_fetches_does_not_take_the_place_of_the_results_that_were_saved(tmp_path: Path) -> None:
+    """REST removes its folder at once, so the page must neither tell of it nor offer its files."""
+    recording = tmp_path / "walk-60.mcap"
+    recording.write_bytes(b"something to hash")
+    bench = Bench(str(recording))
+    bench.do(Seek(10))
+    snapshot = bench.do(Save(tmp_path / "mine"), Save(tmp_path / "fetched", formats=("tum",), fetched=True))
+    while len(snapshot.saved) < 2:
+        snapshot = bench.do(StepFrame())
+    assert (tmp_path / "fetched" / "trajectory.tum").is_file()
+    told = [notice.text for notice in snapshot.notices if notice.text.startswith("Saved in")]
+    assert told == [f"Saved in {tmp_path / 'mine'}."]
+    assert last_saved(snapshot) == tmp_path / "mine"
 
 
 def test_results_are_written_while_replay_goes_on(tmp_path: Path) -> None:
