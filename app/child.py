@@ -129,7 +129,7 @@ class Child(Link):
         main: called there with a `Link` and `args`, all picklable. It ends by returning, or by `LinkClosed`.
         name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: for messages.
         fork: fork a process that has imported what the first such child needs, which takes 20 ms, where possible; else
-            a new interpreter starts, with `environment` added to its variables.
+            a new interpreter starts. environment: variables of the child; unless the owner has them too, no fork has.
         grace_s: how long it may go on working when its owner dies or asks it to end.
     """
 
@@ -143,10 +143,12 @@ class Child(Link):
         environment: Mapping[str, str] | None = None,
         grace_s: float = GRACE_S,
     ) -> None:
+        variables = dict(environment or {})
+        fork = fork and variables.items() <= os.environ.items()
         context = fork_context(main.__module__) if fork else multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         call = pickle.dumps((main, args))  # to be loaded once the variables are set, since that imports numpy
-        self._process = context.Process(target=_run, args=(theirs, name, grace_s, dict(environment or {}), call))
+        self._process = context.Process(target=_run, args=(theirs, name, grace_s, variables, call))
         with _signals_blocked(), _main_hidden():
             self._process.start()
         theirs.close()

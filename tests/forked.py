@@ -6,4 +6,6 @@ import app.sensors.live.process
 import app.server.engine_process
 import app.slam.loops.service
 import app.slam.warmup
-import app.tuning.process  # noqa: F401
+import app.tuning.process
+
+app.slam.loops.service.warm_up()  # on one thread; forks have the kernels

@@ -149,7 +149,7 @@ def hang(owner: Link, grandchild: bool = False) -> None:
 
 
 def reads_environment(owner: Link) -> None:
-    owner.send(os.environ.get("HEMISLAM_TEST", "not set"))
+    owner.send((os.environ.get("HEMISLAM_TEST", "not set"), os.getppid()))
 
 
 def echoing() -> Child:
@@ -261,19 +261,27 @@ def test_one_that_does_not_end_when_asked_is_killed_after_the_time() -> None:
     assert not alive(pid)
 
 
-def test_children_of_children_end_with_them_and_variables_reach_a_new_interpreter(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("HEMISLAM_TEST", raising=False)
+def test_children_of_children_end_with_them() -> None:
     child = Child(hang, True, name="hang", title="The child")
     pids = child.receive(TIMEOUT_S)
     child.close(timeout=0)
     for pid in pids:
         until_gone(pid)
-    child = Child(reads_environment, name="env", title="The child", environment={"HEMISLAM_TEST": "set"})
-    assert child.receive(TIMEOUT_S) == "set"
-    assert "HEMISLAM_TEST" not in os.environ
+
+
+@pytest.mark.parametrize("ours", ["set", None])
+def test_variables_reach_a_child_which_is_a_fork_only_if_its_owner_has_them(
+    ours: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Libraries read them when they are loaded, and those of a fork have been."""
+    monkeypatch.delenv("HEMISLAM_TEST", raising=False)
+    if ours is not None:
+        monkeypatch.setenv("HEMISLAM_TEST", ours)
+    child = Child(reads_environment, name="env", title="The child", fork=True, environment={"HEMISLAM_TEST": "set"})
+    variable, parent = child.receive(TIMEOUT_S)
     child.close()
+    assert variable == "set" and os.environ.get("HEMISLAM_TEST") == ours
+    assert (parent != os.getpid()) == (ours == "set" and sys.platform == "linux")
 
 
 LEFT_OPEN = """

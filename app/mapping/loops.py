@@ -27,7 +27,7 @@ class LoopProcess(Child):
 
     def __init__(self) -> None:
         title = "The process that looks for loops"
-        super().__init__(main, name="loops", title=title, environment=_ONE_THREAD, grace_s=0.0)
+        super().__init__(main, name="loops", title=title, fork=True, environment=_ONE_THREAD, grace_s=0.0)
         self._edges: tuple[LoopEdge, ...] = ()
 
     def receive(self, timeout: float | None = None) -> Reply | None:

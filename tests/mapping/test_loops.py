@@ -142,7 +142,7 @@ def _owner(owner: Link) -> None:
 
 
 def test_a_child_can_own_it_and_it_ends_when_that_child_is_killed() -> None:
-    owner = Child(_owner, name="owner", title="The owner")
+    owner = Child(_owner, name="owner", title="The owner", fork=True)
     pid, count = owner.receive(PATIENCE_S)
     assert count == 1
     assert alive(pid)
