@@ -245,9 +245,11 @@ class Sway:
     def error(self, gyro_unit: float, axes: Axes = AS_IS) -> float:
         """m/s^2, RMS: how far gravity at the end of a span is from where the gyroscope turns it."""
         unit = _matrix(axes) * gyro_unit
+        n, m, _ = self.steps.shape
+        turns = Rotation.from_rotvec((self.steps @ unit.T).reshape(-1, 3)).as_matrix().reshape(n, m, 3, 3)
         gravity = self.begin[:, None, :]
-        for n in range(self.steps.shape[1]):
-            gravity = gravity @ Rotation.from_rotvec(self.steps[:, n] @ unit.T).as_matrix()
+        for step in range(m):
+            gravity = gravity @ turns[:, step]
         return float(np.sqrt(np.mean(np.sum((self.end - gravity[:, 0]) ** 2, axis=1))))
 
 
