@@ -26,6 +26,8 @@ from app.slam.types import F64, Keyframe
 from tests.slam.loops.conftest import PARAMS, Walked, accepted, same
 from tests.slam.loops.walks import drive, error, revisits, take
 
+FINER = LoopsParams(submap_keyframes=5)
+"""Where places must be told apart that odometry does not."""
 LAP = 80
 """Keyframes after which the walk of `walked` sees again what it saw at first."""
 
@@ -74,7 +76,7 @@ def test_every_candidate_says_why(walked: Walked) -> None:
 
 
 def test_corridors_and_rooms_that_repeat_make_no_false_loop() -> None:
-    walk = take("identical", 140.0)
+    walk = take("identical", 120.0)
     backend = drive(walk.drifted(0.01, 0.02), PARAMS)
     errors = np.array([error(edge, walk.truth) for edge in accepted(backend)])
     assert len(errors) > 20, "true revisits are found all the same"
@@ -92,7 +94,7 @@ def test_flats_that_look_alike_stay_beside_one_another_even_if_odometry_drifts_m
 
 
 def test_storeys_that_look_alike_stay_above_one_another() -> None:
-    walk = take("storeys", 75.0)
+    walk = take("storeys", 65.0)
     backend = drive(walk.drifted(0.01, 0.02), PARAMS)
     loops = accepted(backend)
     errors = np.array([error(edge, walk.truth) for edge in loops])
@@ -111,9 +113,9 @@ def test_where_odometry_was_seen_to_break_loops_outvote_it_however_far_off_it_is
     broken = [
         replace(k, T_odom_imu=here @ leap @ lie.inverse(here) @ k.T_odom_imu) if k.index >= at else k for k in keyframes
     ]
-    backend = drive(tuple(broken), PARAMS)
-    across = [edge for edge in accepted(backend) if edge.older < at - PARAMS.submap_keyframes]
-    assert any(edge.evidence.mahalanobis > 4 * PARAMS.max_mahalanobis for edge in across)
+    backend = drive(tuple(broken), FINER)
+    across = [edge for edge in accepted(backend) if edge.older < at - FINER.submap_keyframes]
+    assert any(edge.evidence.mahalanobis > 4 * FINER.max_mahalanobis for edge in across)
     assert max(error(edge, walked.walk.truth)[0] for edge in across) < 0.1
 
 
@@ -134,7 +136,7 @@ def paused(
 def test_loops_tie_the_parts_of_a_walk_that_was_paused(walked: Walked, moved: tuple[float, float, float]) -> None:
     """Whether the walker came back to where the pause began or went on meanwhile."""
     keyframes, at = walked.walk.drifted(0.003, 0.005)[: LAP + 30], 60
-    backend = drive(tuple(paused(keyframes, at, 15.0, moved)), PARAMS)
+    backend = drive(tuple(paused(keyframes, at, 15.0, moved)), FINER)
     across = [edge for edge in accepted(backend) if edge.older < at <= edge.newer]
     assert len(across) > 5
     assert max(error(edge, walked.walk.truth)[0] for edge in across) < 0.3
@@ -147,7 +149,7 @@ def test_loops_tie_the_parts_of_a_walk_that_was_paused(walked: Walked, moved: tu
 def test_after_a_pause_nothing_is_tied_to_a_place_that_looks_the_same() -> None:
     walk = take("identical", 55.0)
     at = 2 * len(walk.keyframes) // 3
-    backend = drive(tuple(paused(walk.drifted(0.01, 0.02), at, 10.0, (1.0, 0.5, 0.0))), PARAMS)
+    backend = drive(tuple(paused(walk.drifted(0.01, 0.02), at, 10.0, (1.0, 0.5, 0.0))), FINER)
     assert any(edge.older < at <= edge.newer and edge.evidence.overlap > 0.8 for edge in backend.edges)
     errors = [error(edge, walk.truth)[0] for edge in accepted(backend)]
     assert max(errors, default=0.0) < 0.5, "the next door is 4 m away, the next corridor 6 m"
