@@ -7,6 +7,7 @@ program ends its children in order. A child whose owner dies ends by itself.
 
 import atexit
 import contextlib
+import gc
 import logging
 import math
 import multiprocessing
@@ -205,6 +206,8 @@ def _run(
     connection: "Connection[Any, Any]", name: str, grace_s: float, environment: dict[str, str], call: bytes
 ) -> None:
     """The process."""
+    gc.freeze()  # else its garbage collector writes to the pages of what the fork server imported, which forks share
+    gc.enable()
     os.environ.update(environment)
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
@@ -240,7 +243,7 @@ def fork_context(module: str) -> ForkServerContext | SpawnContext:
     if sys.platform != "linux":  # macOS cannot fork a process that has used its frameworks
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([module, "app.fork_server"])
+    context.set_forkserver_preload(["app.fork_server", module])
     with _signals_blocked(), _main_hidden():
         forkserver.ensure_running()
     return context

@@ -23,6 +23,7 @@ from app.child import fork_context
 from app.slam.errors import HemislamError
 
 sys.dont_write_bytecode = False  # of this process, as above
+gc.disable()  # until all tests are imported and collected
 
 # The same examples on every run, and no verdict by the clock.
 settings.register_profile("hemislam", deadline=None, derandomize=True, max_examples=50)
@@ -55,6 +56,7 @@ def pytest_collection_finish() -> None:
     """What is imported and collected stays: looking for garbage in it took a fifth of the time of the page's tests."""
     gc.collect()
     gc.freeze()
+    gc.enable()
     gc.set_threshold(20_000, 20, 20)
 
 

@@ -60,17 +60,46 @@ def owned(text: str, *, timeout: float = 60.0) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
-@forked
-def test_engines_show_their_name_and_are_forks_of_the_same_process() -> None:
-    code, out, err = owned("""
+@pytest.fixture(scope="module")
+def told() -> list[str]:
+    """What an owner of three engines in turn tells; it kills the fork server of the second, and at last itself."""
+    _, out, err = owned("""
 first = begin()
 forked = parent(first)
 print(name(first), name(forked), parent(forked) == os.getpid())
 engine.close()
-print(parent(begin()) == forked)
+pid = begin()
+print(parent(pid) == forked)
+os.kill(forked, signal.SIGKILL)
+time.sleep(0.2)
+engine.send(Seek(250))
+until(lambda: engine.snapshot.transport.frame >= 250)
+print(engine.snapshot.engine_alive and engine.pid == pid)
 engine.close()
+another = parent(begin())
+print(another not in (forked, os.getpid()), another, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
 """)
-    assert (code, out.split(), err) == (0, ["hemislam-engine", "hemislam-forks", "True", "True"], "")
+    assert err == ""
+    return out.split()
+
+
+@forked
+def test_engines_show_their_name_and_are_forks_of_the_same_process(told: list[str]) -> None:
+    assert told[:4] == ["hemislam-engine", "hemislam-forks", "True", "True"]
+
+
+@forked
+def test_without_the_fork_server_an_engine_goes_on_and_the_next_one_has_another(told: list[str]) -> None:
+    assert told[4:6] == ["True", "True"]
+
+
+@forked
+def test_the_fork_server_is_gone_with_its_owner(told: list[str]) -> None:
+    deadline = time.monotonic() + 30.0
+    while (forked := Path(f"/proc/{int(told[6])}")).exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not forked.exists()
 
 
 @forked
@@ -95,35 +124,6 @@ print(engine.pid == pid, engine.snapshot.engine_alive)
 engine.close()
 """)
     assert (code, out.split(), err) == (0, ["True", "True"], "")
-
-
-@forked
-def test_without_the_fork_server_an_engine_goes_on_and_the_next_one_has_another() -> None:
-    code, out, err = owned("""
-pid = begin()
-forked = parent(pid)
-os.kill(forked, signal.SIGKILL)
-time.sleep(0.2)
-engine.send(Seek(250))
-until(lambda: engine.snapshot.transport.frame >= 250)
-print(engine.snapshot.engine_alive and engine.pid == pid)
-engine.close()
-print(parent(begin()) not in (forked, os.getpid()))
-engine.close()
-""")
-    assert (code, out.split(), err) == (0, ["True", "True"], "")
-
-
-@forked
-def test_the_fork_server_is_gone_with_its_owner() -> None:
-    _, out, _ = owned("""
-print(parent(begin()), flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-""")
-    deadline = time.monotonic() + 30.0
-    while (forked := Path(f"/proc/{int(out)}")).exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert not forked.exists()
 
 
 # --- any child -----------------------------------------------------------------------------------
