@@ -67,8 +67,18 @@ def until_gone(pid: int) -> None:
         time.sleep(0.02)
 
 
-def test_it_answers_as_one_in_this_process_would(process: LoopProcess) -> None:
-    far = rows(lie.transform(np.eye(3), np.array([0.5, 0.1, 0.0])))
+@pytest.fixture(params=["a fork", "a new interpreter"])
+def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[LoopProcess]:
+    """As in these tests, and as in a program whose libraries use several threads."""
+    if request.param == "a new interpreter":
+        monkeypatch.delenv("OMP_NUM_THREADS")
+    process = LoopProcess()
+    yield process
+    process.close()
+
+
+def test_it_answers_as_one_in_this_process_would(either: LoopProcess) -> None:
+    process, far = either, rows(lie.transform(np.eye(3), np.array([0.5, 0.1, 0.0])))
     add, reject = Add(1, 5, far, register=False), Reject(1, 5)
     requests: list[Request] = []
     for keyframe in keyframes():
