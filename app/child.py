@@ -130,7 +130,9 @@ class Child(Link):
         main: called there with a `Link` and `args`, all picklable. It ends by returning, or by `LinkClosed`.
         name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: for messages.
         fork: fork a process that has imported what the first such child needs, which takes 20 ms, where possible; else
-            a new interpreter starts. environment: variables of the child; unless the owner has them too, no fork has.
+            a new interpreter starts.
+        environment: variables of the child. If the owner lacks them, a new interpreter starts also with `fork`, since
+            libraries read such variables when they are imported.
         grace_s: how long it may go on working when its owner dies or asks it to end.
     """
 

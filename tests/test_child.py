@@ -267,6 +267,7 @@ def test_children_of_children_end_with_them() -> None:
     child.close(timeout=0)
     for pid in pids:
         until_gone(pid)
+    assert not any(alive(pid) for pid in pids)
 
 
 @pytest.mark.parametrize("ours", ["set", None])

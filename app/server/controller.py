@@ -78,7 +78,7 @@ class Controller:
         self._page = page
         self._loops, self._player, self._writer = LoopCommands(page), Player(page, clock), SessionWriter()
         self._georeferencing = Georeferencing(page)
-        self._saves: deque[tuple[Path, bool, Future[Any]]] = deque()
+        self._saves: deque[tuple[protocol.Save, Future[Any]]] = deque()
         self._share = 0.0  # of a save that is written
         self._shown_share: protocol.Progress | None = None
         self._open_session, self._resolve, self._session_folder = open_session, resolve, session_folder
@@ -146,11 +146,11 @@ class Controller:
                     self._page.notice("warning", text)
             case protocol.Restart():
                 self._open_soon(self._need_session().feed.info.path, self._reopen)
-            case protocol.Save(folder, formats, choice, fetched):
+            case protocol.Save(folder, formats, choice):
                 session = self._need_session()
                 saved = session.saved(self._state(session))
                 save = session.save(folder, session=saved, formats=formats, choice=choice, progress=self._set_share)
-                self._saves.append((folder, fetched, save))
+                self._saves.append((command, save))
             case protocol.EditLabels(keyframe, labels):
                 self._need_session().keyframes.edit(keyframe, labels)
                 self._page.show_again(keyframe)
@@ -221,15 +221,15 @@ class Controller:
             self._page.notice("warning", self._writer.error)
 
     def _work(self) -> float | None:
-        while self._saves and self._saves[0][-1].done():
-            folder, fetched, save = self._saves.popleft()
+        while self._saves and self._saves[0][1].done():
+            command, save = self._saves.popleft()
             self._share = 0.0
             error = save.exception()
             if error is not None and not isinstance(error, HemislamError):
-                log.error("Saving to %s failed", folder, exc_info=error)
+                log.error("Saving to %s failed", command.folder, exc_info=error)
             self._show_share(None)
-            told = "" if error is None else str(error) or type(error).__name__
-            self._page.saved(protocol.Saved(folder, told, fetched))
+            why = "" if error is None else str(error) or type(error).__name__
+            self._page.saved(protocol.Saved(command.folder, why, command.fetched))
         if self._saves:
             self._show_share(self._share)
         if self._opening is not None:

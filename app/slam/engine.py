@@ -173,10 +173,8 @@ class Engine:
         due = not (begun.waiting or settling) and (paused is not None or self._is_due(posterior))
         if due and status is FrameStatus.TRACKING and paused is None and p.filter.learn_lines:
             lines = self._learnt(lines, posterior, fused.points, scan.ring)
-        ride = None
-        if begun.ride is not None:
-            ride = self._followed(begun.ride, scan, samples, clock.sigma)
-        else:
+        ride = None if begun.ride is None else self._followed(begun.ride, scan, samples, clock.sigma)
+        if not begun.waiting:
             self._insert(posterior, fused)
         watch.lap("insert")
 

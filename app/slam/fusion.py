@@ -24,6 +24,10 @@ NOT_REGISTERED = Registration(
     False, 0, 0, 0, float("nan"), np.full(6, np.nan), False, "the map is still empty; this scan begins it"
 )
 
+BETTER, SAME_PART = 0.5, 0.9
+"""A scan that contradicts the IMU, and without it fits the map with at most this share of the residuals and at least
+this share of the points, shows that the IMU was wrong about the whole scan: it was knocked, or froze."""
+
 
 @dataclass(frozen=True, slots=True)
 class Fused:
@@ -40,11 +44,6 @@ class Fused:
     sampled: F32
     lost: bool = False
     imu_wrong: bool = False
-
-
-BETTER, SAME_PART = 0.5, 0.9
-"""A scan that contradicts the IMU, and without it fits the map with at most this share of the residuals and at least
-this share of the points, shows that the IMU was wrong about the whole scan: it was knocked, or froze."""
 
 
 def fuse(
