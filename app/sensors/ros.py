@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from app.sensors import livox
 from app.sensors.livox import CUSTOM_MSGS, CustomMsg
@@ -21,7 +22,7 @@ LIDAR_TOPIC, IMU_TOPIC = "/rslidar_points", "/imu/data"
 CLOUD, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 ENCODINGS: Final = {"cdr": "ros2msg", "ros1": "ros1msg"}
 """Encodings of messages that can be read, and how their definitions are written."""
-
+_STORES: Final = {"cdr": Stores.ROS2_HUMBLE, "ros1": Stores.ROS1_NOETIC}
 
 _ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
@@ -33,13 +34,13 @@ class Deserialiser:
     """Reads messages of the standard types, and of those whose definitions it was given."""
 
     def __init__(self) -> None:
-        self._stores = {"cdr": get_typestore(Stores.ROS2_HUMBLE), "ros1": get_typestore(Stores.ROS1_NOETIC)}
+        self._stores: dict[str, Typestore] = {}
 
     def learn(self, kind: str, definition: str, encoding: str) -> None:
         """Read messages of this type too; a definition that makes no sense is ignored."""
-        store = self._stores.get(encoding)
-        if store is None or kind in store.types or not definition:
+        if not definition or encoding not in ENCODINGS or self.knows(kind, encoding):
             return
+        store = self._store(encoding)
         try:
             found = get_types_from_msg(definition, kind)
             store.register({name: fields for name, fields in found.items() if name not in store.types})
@@ -48,15 +49,21 @@ class Deserialiser:
 
     def knows(self, kind: str, encoding: str) -> bool:
         """Whether messages of this type can be read."""
-        return encoding in self._stores and (kind in CUSTOM_MSGS or kind in self._stores[encoding].types)
+        return encoding in ENCODINGS and (kind in CUSTOM_MSGS or kind in self._store(encoding).types)
 
     def read(self, data: bytes, kind: str, encoding: str) -> Any:
         """The message. Raises whatever the library raises for bytes that are no such message."""
         if kind in CUSTOM_MSGS:
             return CustomMsg.of(data, encoding)
-        store = self._stores[encoding]
+        store = self._store(encoding)
         view = memoryview(data)  # the library slices it, which would copy every cloud
         return store.deserialize_ros1(view, kind) if encoding == "ros1" else store.deserialize_cdr(view, kind)
+
+    def _store(self, encoding: str) -> Typestore:
+        """Made when it is first needed: importing all types of a ROS takes a tenth of a second."""
+        if encoding not in self._stores:
+            self._stores[encoding] = get_typestore(_STORES[encoding])
+        return self._stores[encoding]
 
 
 def ros2_type(name: str) -> str:
