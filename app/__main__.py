@@ -1,6 +1,7 @@
 """The command line: the only place that wires the rooms together. It imports them when they are needed."""
 
 import contextlib
+import gc
 import io
 import sys
 from pathlib import Path
@@ -25,6 +26,8 @@ from app.slam.errors import HemislamError
 
 LEAST_MEMORY = 900 << 20
 """Bytes of addresses that numba, its threads and a walk take."""
+GARBAGE = 20_000, 2, 2
+"""When Python looks for garbage, as `gc.set_threshold`: not amid a start, which makes 100,000 objects that stay."""
 
 
 class _Commands(TyperGroup):
@@ -292,6 +295,7 @@ def _require_memory() -> None:
 
 def main() -> None:
     """The console script."""
+    gc.set_threshold(*GARBAGE)
     _require_memory()
     if TEMPORARY_KERNEL_CACHE:
         typer.echo(
