@@ -6,8 +6,8 @@ The known libraries for this do not give positions in the file, which reading fr
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 CLASSIC_MAGIC = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
@@ -87,50 +87,39 @@ class Capture:
         place = place or self._start
         with self._path.open("rb") as file:
             file.seek(place.position)
-            for at, time_ns, link, frame in self._frames(file, place):
-                packet = _ip_packet(link, frame)
-                if packet and 0 <= time_ns < _FAR_NS:
-                    payload = _udp_payload(packet, waiting)
-                    if payload is not None:
-                        sender = packet[12:16] if packet[0] >> 4 == 4 else packet[8:24]
-                        yield Datagram(at, time_ns, payload, sender)
+            try:
+                for at, time_ns, link, frame in self._frames(file, place):
+                    packet = _ip_packet(link, frame)
+                    if packet and 0 <= time_ns < _FAR_NS:
+                        payload = _udp_payload(packet, waiting)
+                        if payload is not None:
+                            sender = packet[12:16] if packet[0] >> 4 == 4 else packet[8:24]
+                            yield Datagram(at, time_ns, payload, sender)
+            except EOFError:
+                self.complete = False
 
-    def _classic_frames(self, file: BinaryIO, place: CapturePlace) -> Iterator[Captured]:
-        header = struct.Struct(place.order + "4I")
+    def _classic_frames(self, file: BufferedReader, place: CapturePlace) -> Iterator[Captured]:
+        """Raises EOFError where the file makes no sense, or ends within a frame. So does `_next_frames`."""
         (interface,) = place.interfaces
-        while True:
+        while file.peek(1):
             position = file.tell()
-            raw = file.read(16)
-            if not raw:
-                return
-            if len(raw) < 16:
-                break
-            seconds, fraction, length, _ = header.unpack(raw)
-            data = file.read(length) if length <= MAX_RECORD else b""
-            if len(data) < length:
-                break
+            seconds, fraction, length, _ = struct.unpack(place.order + "4I", _taken(file, 16))
+            data = _taken(file, length)
             time_ns = seconds * 1_000_000_000 + fraction * 1_000_000_000 // interface.units
             yield CapturePlace(position, place.order, place.interfaces), time_ns, interface.link, data
-        self.complete = False
 
-    def _next_frames(self, file: BinaryIO, place: CapturePlace) -> Iterator[Captured]:
+    def _next_frames(self, file: BufferedReader, place: CapturePlace) -> Iterator[Captured]:
         order, interfaces = place.order, place.interfaces
-        while True:
+        while file.peek(1):
             position = file.tell()
-            raw = file.read(8)
-            if not raw:
-                return
-            if len(raw) < 8:
-                break
+            raw = _taken(file, 8)
             if raw[:4] == NEXT_MAGIC:  # a section begins, perhaps in another byte order
                 order, interfaces = "<" if file.read(4) == b"\x4d\x3c\x2b\x1a" else ">", ()
                 file.seek(position + 8)
             kind, length = struct.unpack(order + "2I", raw)
-            if not 12 <= length <= MAX_RECORD or length % 4:
-                break
-            body = file.read(length - 8)
-            if len(body) < length - 8:
-                break
+            if length < 12 or length % 4:
+                raise EOFError
+            body = _taken(file, length - 8)
             if kind == 1 and len(body) >= 12 and len(interfaces) < _MOST_INTERFACES:
                 interfaces = (*interfaces, _interface(body, order))
             elif kind == 6 and len(body) >= 24:
@@ -139,7 +128,13 @@ class Capture:
                     interface = interfaces[number]
                     time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns
                     yield CapturePlace(position, order, interfaces), time_ns, interface.link, body[20 : 20 + captured]
-        self.complete = False
+
+
+def _taken(file: BufferedReader, size: int) -> bytes:
+    """The next bytes. Raises EOFError: there are fewer, or no record is as large."""
+    if size > MAX_RECORD or len(data := file.read(size)) < size:
+        raise EOFError
+    return data
 
 
 def _interface(body: bytes, order: str) -> _Interface:
