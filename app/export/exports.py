@@ -132,7 +132,7 @@ EXPORTS = (
     _wanted("las", "map.las", "the map as LAS 1.4: time, intensity, ring, ground, moving", "las.write_las"),
     _wanted("laz", "map.laz", "the same, compressed", "las.write_laz"),
     _wanted("e57", "map.e57", "the map as E57: one scan with its pose per keyframe", "e57.write", "e57"),
-    _wanted("pcd", "map.pcd", "the map as PCD: intensity ring ground moving time", "pcd.write"),
+    _wanted("pcd", "map.pcd", "the map as PCD: intensity ring ground moving time", "map_file.write_pcd"),
     _wanted("kitti", "trajectory.kitti", "poses as rows of 12 numbers, without stamps", "paths.write_kitti"),
     _wanted("csv", "trajectory.csv", "poses with easting, northing, height if known", "paths.write_csv"),
     _wanted("gpx", "trajectory.gpx", "the walk as a GPX track", "paths.write_gpx", on_earth=True),

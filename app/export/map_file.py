@@ -1,4 +1,7 @@
-"""The map as PLY. After the points it holds the keyframes, so that other formats can be made of it later."""
+"""The map as PLY, and as PCD 0.7 for the Point Cloud Library.
+
+After its points the PLY holds the keyframes, so that other formats can be made of it later.
+"""
 
 import os
 from collections.abc import Iterable
@@ -8,8 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from app.export.points import Block
+from app.export.results import Results
 from app.slam.errors import HemislamError
-from app.slam.ply import header
+from app.slam.ply import header, pcd_header
 from app.slam.types import GROUND, MOVING, NON_GROUND, Cloud, Keyframe, is_ground
 
 VERTEX = np.dtype(
@@ -30,6 +34,9 @@ KEYFRAME = np.dtype(
     + [(name, "<f8") for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 )
 """How many of the points are its own, the end of its scan, and T_map_lidar."""
+PCD_POINT = np.dtype(
+    [(name, VERTEX[name]) for name in ("x", "y", "z", "intensity", "ring", "ground", "moving", "time")]
+)
 COMMENT = "hemislam map, metres, z up"
 
 
@@ -41,7 +48,7 @@ def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
     with path.open("wb") as file:
         file.write(header(VERTEX, 0, COMMENT, keyframe=KEYFRAME))
         for block in blocks:
-            file.write(vertices_of(block, VERTEX).data)
+            file.write(_vertices_of(block, VERTEX).data)
             T = block.T_map_lidar
             pose = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
             keyframes.append((len(block), *divmod(block.stamp_ns, 1_000_000_000), *pose))
@@ -53,7 +60,19 @@ def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
     return count, moving
 
 
-def vertices_of(block: Block, layout: np.dtype) -> np.ndarray:
+def write_pcd(path: Path, results: Results) -> None:
+    """Points alone. Their number enters the header at the end, too."""
+    count = 0
+    with path.open("wb") as file:
+        file.write(pcd_header(PCD_POINT, 0, COMMENT))
+        for block in results.blocks():
+            file.write(_vertices_of(block, PCD_POINT).data)
+            count += len(block)
+        file.seek(0)
+        file.write(pcd_header(PCD_POINT, count, COMMENT))
+
+
+def _vertices_of(block: Block, layout: np.dtype) -> np.ndarray:
     """(n,) points with the columns of `VERTEX`, in the layout of a file."""
     vertices = np.empty(len(block), layout)
     vertices["x"], vertices["y"], vertices["z"] = block.points.T
