@@ -208,7 +208,6 @@ def simulate(
       hemislam simulate corridor --out livox.mcap --scanner mid360 --tables tables/
       hemislam simulate --suite paper --out suite/
     """
-    from app.cli.suite import make_suite
     from app.sensors.simulator import SCENES, simulate
     from app.sensors.simulator.gnss import Gnss
     from app.sensors.simulator.imperfections import IMPERFECT, NONE
@@ -222,7 +221,7 @@ def simulate(
         if given := [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise HemislamError(f"--suite does not take {names}; leave them out, or name a SCENE.")
-        make_suite(suite, out, [seed], short=short, every_block=every_block, imperfections=imperfections)
+        options.make_suite(suite, out, [seed], short=short, every_block=every_block, imperfections=imperfections)
         return
     if scene is None:
         raise HemislamError(f"Name a SCENE, one of {', '.join(SCENES)}, or use --suite paper.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.options import MOST_S, Duration, Imperfect, ParamsFor, Short, Suite, with_params
+from app.cli.options import MOST_S, Duration, Imperfect, ParamsFor, Short, Suite, make_suite, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
 from app.slam.text_files import make_folder
@@ -125,7 +125,6 @@ def evaluate(
       hemislam evaluate --suite paper --short --out results
     """
     from app.cli.run import compile_behind_bar
-    from app.cli.suite import make_suite
     from app.evaluation.evaluate import evaluate as run_evaluation
     from app.evaluation.variants import choose_variants, parse_variant
     from app.sensors.simulator.imperfections import IMPERFECT, NONE

@@ -1,4 +1,4 @@
-"""What several commands share: options, what becomes of them, and a progress bar."""
+"""What several commands share: options, what becomes of them, a progress bar, and suites of simulated recordings."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
+from app.slam.text_files import make_folder
+
 if TYPE_CHECKING:
+    from app.sensors.simulator.imperfections import Imperfections
     from app.slam.params import Params
 
 RecordingPath = Annotated[
@@ -148,3 +151,40 @@ def progress_bar(description: str, **options: Any) -> Iterator[Callable[..., Non
             bar.update(done - bar.n)
 
         yield show
+
+
+def make_suite(
+    name: str,
+    folder: Path,
+    seeds: list[int],
+    *,
+    short: bool,
+    imperfections: "Imperfections",
+    every_block: int | None = None,
+) -> list[Path]:
+    """Make the recordings of a suite that do not exist yet, and return all of them.
+
+    Raises:
+        HemislamError: there is no such suite, or the recordings cannot be written.
+    """
+    from app.sensors.simulator.suite import find_suite, make_twin
+
+    twins = find_suite(name)
+    make_folder(folder)
+    recordings = []
+    for seed in seeds:
+        for twin in twins:
+            with progress_bar(f"{twin.name}, seed {seed}", unit=" scans") as show:
+                made = make_twin(
+                    twin,
+                    folder,
+                    seed=seed,
+                    short=short,
+                    every_block=every_block,
+                    imperfections=imperfections,
+                    progress=show,
+                )
+            state = "made" if made.new else "exists already"
+            typer.echo(f"{made.recording}: {made.distance_m:.1f} m walked, {state}")
+            recordings.append(made.recording)
+    return recordings
