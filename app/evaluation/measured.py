@@ -113,9 +113,10 @@ class Outcome:
     @property
     def ground(self) -> list[GroundScore] | None:
         """Scores by range; None if points carry no labels or the variant segments no ground."""
-        if self.run is None or self.run["ground"] is None or not self.run["parameters"]["ground"]["enabled"]:
+        scores = (self.run or {}).get("ground")
+        if self.run is None or scores is None or not self.run["parameters"]["ground"]["enabled"]:
             return None
-        return [GroundScore(**score) for score in self.run["ground"]]
+        return [GroundScore(**score) for score in scores]
 
 
 @dataclass(frozen=True, slots=True)

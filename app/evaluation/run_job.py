@@ -102,13 +102,7 @@ def run_baseline(job: Job, progress: Callable[[int, int], None]) -> None:
             poses.append(pose)
             progress(len(poses), feed.info.frames or 0)
         trajectory = Trajectory.from_poses(stamps, np.array(poses))
-        facts = _common(job) | {
-            "lost": lost,
-            "dropped": dict(dropped.most_common()),
-            "loops": None,
-            "ground_share": None,
-            "ground": None,
-        }
+        facts = _common(job) | {"lost": lost, "dropped": dict(dropped.most_common())}
         kept = np.array([keyframe.T_odom_imu for keyframe in keyframes]).reshape(-1, 4, 4)
         _write(job, feed.info, trajectory, np.array(times), keyframes, kept, facts)
     finally:

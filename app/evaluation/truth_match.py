@@ -66,11 +66,11 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
     if truth.own_clock and offset_s is not None:
         added_s = offset_s
     elif truth.own_clock:
-        found = find_offset(estimate, there, by_rotation=truth.quaternions is not None)
-        added_s = found.offset_s
+        by_rotation = truth.quaternions is not None
+        added_s, correlation = find_offset(estimate, there, by_rotation=by_rotation)
         notes.append(
             f"Its clock is not the recording's: {added_s:+.3f} s were added, found by aligning the"
-            f" {found.what} of both (correlation {found.correlation:.3f})."
+            f" {_speed(by_rotation)} of both (correlation {correlation:.3f})."
         )
     there = replace(there, stamps_ns=stamps_ns + round(added_s * 1e9))
     lever = np.array(truth.lever)
@@ -139,27 +139,17 @@ def _vector(values: F64) -> str:
 
 
 # --- the offset between two clocks ----------------------------------------------------------------
-@dataclass(frozen=True, slots=True)
-class Offset:
-    """Attributes:
-    offset_s: time to add to the truth's stamps. correlation: of both motions then, up to 1.
-    what: the quantity that was compared.
-    """
-
-    offset_s: float
-    correlation: float
-    what: str
-
-
-def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -> Offset:
+def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -> tuple[float, float]:
     """Compare the angular speed (or, without orientations, the speed), which does not depend on the axes.
 
     First over all offsets at which both overlap for at least half of the shorter one, then around the best to FINE_S.
 
+    Returns:
+        s to add to the truth's stamps, and the correlation of both motions then, up to 1.
+
     Raises:
         HemislamError: they are too short, or similar at no offset.
     """
-    what = "angular speed" if by_rotation else "speed"
     window_s = 0.2 if by_rotation else 1.0
     spans = [(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in (estimate, truth)]
     if min(spans) < MIN_OVERLAP_S:
@@ -173,7 +163,7 @@ def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -
     best = int(np.argmax(correlations))
     if correlations[best] < MIN_CORRELATION:
         raise HemislamError(
-            f"The {what} of the truth matches that of the recording at no offset (correlation"
+            f"The {_speed(by_rotation)} of the truth matches that of the recording at no offset (correlation"
             f" {correlations[best]:.2f} at best); is it the truth of this recording?"
         )
     coarse = lags[best] * GRID_S
@@ -185,7 +175,11 @@ def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -
     scores = [_pearson(ours, np.interp(at - shift, grid, fine, left=np.nan, right=np.nan)) for shift in candidates]
     chosen = int(np.argmax(scores))
     starts = (estimate.stamps_ns[0] - truth.stamps_ns[0]) * 1e-9
-    return Offset(float(starts + candidates[chosen]), float(scores[chosen]), what)
+    return float(starts + candidates[chosen]), float(scores[chosen])
+
+
+def _speed(by_rotation: bool) -> str:
+    return "angular speed" if by_rotation else "speed"
 
 
 def _motion(trajectory: Trajectory, step_s: float, window_s: float, by_rotation: bool) -> F64:
