@@ -77,5 +77,5 @@ class CloudReader:
         probes = stamped([probe for _, probe, _ in waiting])
         layout, findings = settle_cloud(probes, self._params.recording, self._topic, self._kind)
         self._layout = layout
-        intake.put_findings(findings)
+        intake.put_findings("configuration", "LiDAR", findings)
         return [(read_scan(message, probe.log_ns, layout)[1], at) for message, probe, at in waiting]

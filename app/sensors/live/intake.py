@@ -130,14 +130,14 @@ class Intake:
 
     def put_status(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
         with self._changed:
-            self._tell(kind, sensor, text)
+            self._rest.append(Status(kind, sensor, text, time.time_ns()))
             self._changed.notify()
 
-    def put_findings(self, findings: list[Finding]) -> None:
-        """How clouds are read, where that is not as expected."""
-        with self._changed:
-            self._tell_findings("configuration", "LiDAR", findings)
-            self._changed.notify()
+    def put_findings(self, kind: Kind, sensor: Literal["LiDAR", "IMU"], findings: list[Finding]) -> None:
+        """What was found of a sensor, where that is not as expected."""
+        for finding in findings:
+            if finding.verdict != "fine":
+                self.put_status(kind, sensor, f"{finding.subject}: {finding.spoken}")
 
     def end(self) -> None:
         """Record what is still held back; nothing is put any more."""
@@ -193,7 +193,12 @@ class Intake:
                 held, self._held = self._held, None
                 for waiting in held:
                     self._release(waiting)
-        self._bound()
+        while len(self._scans) > MAX_BACKLOG:
+            oldest = self._scans.popleft()
+            self._rest.append(DroppedScan(oldest.stamp_ns, BUSY))
+            self.counters.dropped += 1
+        while len(self._rest) > MAX_WAITING:
+            self._rest.popleft()
         self._changed.notify()
 
     def _settled(self) -> bool:
@@ -225,7 +230,7 @@ class Intake:
         if span_ns < _SETTLE_NS:
             if not self._still_reported and samples[-1].log_ns - samples[0].log_ns > 5 * _SETTLE_NS:
                 self._still_reported = True
-                self._tell("clocks", "IMU", "the IMU's stamps do not advance; check its driver")
+                self.put_status("clocks", "IMU", "the IMU's stamps do not advance; check its driver")
             return False
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)
@@ -241,9 +246,9 @@ class Intake:
         except HemislamError as error:
             if not self._unusable_reported:
                 self._unusable_reported = True
-                self._tell("units", "IMU", str(error))
+                self.put_status("units", "IMU", str(error))
             return False
-        self._tell_findings("units", "IMU", findings)
+        self.put_findings("units", "IMU", findings)
         self._unit_reported |= any("deg/s" in finding.text for finding in findings)
         self._units_settled = True
         return True
@@ -271,11 +276,15 @@ class Intake:
                 text = (
                     f"the scans arrive {-offset:.3f} s after the IMU's samples of the same time, as over a slow network"
                 )
-                self._tell("clocks", "source", f"{text}; the stamps are used: if they are wrong, use ?clock=host")
+                self.put_status("clocks", "source", f"{text}; the stamps are used: if they are wrong, use ?clock=host")
             elif apart:
-                self._tell("clocks", "source", f"{wrong}: both are stamped by the host's clock instead, on arrival")
+                self.put_status(
+                    "clocks", "source", f"{wrong}: both are stamped by the host's clock instead, on arrival"
+                )
         elif self._clock == "sensor" and apart:
-            self._tell("clocks", "source", f"{wrong}; use ?clock=host, or --set recording.imu_time_offset={offset:.3f}")
+            self.put_status(
+                "clocks", "source", f"{wrong}; use ?clock=host, or --set recording.imu_time_offset={offset:.3f}"
+            )
         for clock_map in self._maps.values():
             clock_map.host = self._clock == "host"
 
@@ -311,7 +320,7 @@ class Intake:
         self._too_fast = self._too_fast + 1 if rate > TOO_FAST else 0
         if self._too_fast == _TOO_FAST_SAMPLES and not self._unit_reported:
             self._unit_reported = True
-            self._tell_findings("units", "IMU", [too_fast(rate)])
+            self.put_findings("units", "IMU", [too_fast(rate)])
         self._rest.append(ImuEntry(entry.log_ns, stamp, gyro, accel))
 
     def _release_scan(self, entry: ScanEntry) -> None:
@@ -332,26 +341,10 @@ class Intake:
         if clock_map.jumped_at_ns != before:
             self.counters.jumps += 1
             self._offset.clear()
-            self._tell(
+            self.put_status(
                 "jump", name, f"the {name}'s clock was set by {clock_map.jump_ns / 1e9:+.3f} s; its time continues"
             )
         return mapped
-
-    def _tell(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
-        self._rest.append(Status(kind, sensor, text, time.time_ns()))
-
-    def _tell_findings(self, kind: Kind, sensor: Literal["LiDAR", "IMU"], findings: list[Finding]) -> None:
-        for finding in findings:
-            if finding.verdict != "fine":
-                self._tell(kind, sensor, f"{finding.subject}: {finding.spoken}")
-
-    def _bound(self) -> None:
-        while len(self._scans) > MAX_BACKLOG:
-            oldest = self._scans.popleft()
-            self._rest.append(DroppedScan(oldest.stamp_ns, BUSY))
-            self.counters.dropped += 1
-        while len(self._rest) > MAX_WAITING:
-            self._rest.popleft()
 
 
 def _rate(times: deque[int], now: int) -> float:

@@ -111,7 +111,9 @@ class LiveSource(AbstractContextManager["LiveSource"]):
 
         While the IMU is silent, the next scan sends the waiting one on its way.
         """
-        silent = self._imu_is_silent()
+        if self._heard_ns != self._sequencer.newest_imu_ns:
+            self._heard_ns, self._heard_at = self._sequencer.newest_imu_ns, time.monotonic()
+        silent = time.monotonic() - self._heard_at > SILENCE_S  # of samples that the sequencer accepts
         rest, scan = self._intake.take(timeout_s, scan=silent or not self._sequencer.waiting)
         for entry in rest:
             if isinstance(entry, ImuEntry):
@@ -121,12 +123,6 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         if scan is not None:
             self._sequencer.add_scan(scan)
         self._events.extend(self._sequencer.ready(1 if silent else MAX_WAITING))
-
-    def _imu_is_silent(self) -> bool:
-        """Whether no sample that the sequencer accepts has come for a while."""
-        if self._heard_ns != self._sequencer.newest_imu_ns:
-            self._heard_ns, self._heard_at = self._sequencer.newest_imu_ns, time.monotonic()
-        return time.monotonic() - self._heard_at > SILENCE_S
 
     def _watch(self) -> None:
         """Report sensors that fell silent or are back, and a recording that failed."""
