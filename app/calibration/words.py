@@ -27,6 +27,8 @@ def table(calibration: Calibration) -> list[tuple[str, str]]:
     x, y, z = c.moved.p_imu_lidar
     sx, sy, sz = sigmas["translation"]
     rotation, offset = np.degrees(sigmas["rotation"].max()), float(sigmas["offset"][0]) * 1e3
+    turning = np.degrees([_rms(c.turned.before), _rms(c.turned.after)])
+    motion = _rms(c.moved.before) * 1e3, _rms(c.moved.after) * 1e3
     return [
         ("rotation of the LiDAR on the IMU", _if(
             observed["rotation"], f"roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} ± {rotation:.2f} deg"
@@ -38,11 +40,11 @@ def table(calibration: Calibration) -> list[tuple[str, str]]:
         ("bias of the gyroscope", _vector(np.degrees(c.turned.bias), np.degrees(sigmas["gyro_bias"]), "deg/s")),
         ("bias of the accelerometer", _vector(c.moved.bias, sigmas["accel_bias"], "m/s²")),
         *_of_lines(c.lines),
-        ("noise of the gyroscope", _noise(c.gyro_noise, 1e3, "mrad/s/√Hz")),
-        ("noise of the accelerometer", _noise(c.accel_noise, 1e3, "mm/s²/√Hz")),
+        ("noise of the gyroscope", _noise(c.gyro_noise, "mrad/s/√Hz")),
+        ("noise of the accelerometer", _noise(c.accel_noise, "mm/s²/√Hz")),
         ("down at the start, LiDAR frame", ", ".join(f"{value:+.3f}" for value in c.down)),
-        ("turning by scans against IMU", f"{_degrees(c.turned.before)} deg before, {_degrees(c.turned.after)} after"),
-        ("motion by scans against IMU", f"{_mm(c.moved.before)} mm before, {_mm(c.moved.after)} after"),
+        ("turning by scans against IMU", f"{turning[0]:.3f} deg before, {turning[1]:.3f} after"),
+        ("motion by scans against IMU", f"{motion[0]:.1f} mm before, {motion[1]:.1f} after"),
         ("scans to the map", f"{c.residuals[0] * 1e3:.1f} mm without the IMU, {c.residuals[1] * 1e3:.1f} with the IMU"),
     ]  # fmt: skip
 
@@ -142,19 +144,11 @@ def _vector(values: np.ndarray, sigmas: np.ndarray, unit: str) -> str:
     return ", ".join(f"{v:.3f} ± {s:.3f}" for v, s in zip(values, sigmas, strict=True)) + f" {unit}"
 
 
-def _noise(noise: Noise, scale: float, unit: str) -> str:
+def _noise(noise: Noise, unit: str) -> str:
     if not np.isfinite(noise.density):
         return "not known: it takes four seconds of evenly spaced samples"
-    return f"{noise.density * scale:.2f} ± {noise.sigma * scale:.2f} {unit}"
+    return f"{noise.density * 1e3:.2f} ± {noise.sigma * 1e3:.2f} {unit}"
 
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _degrees(values: np.ndarray) -> str:
-    return f"{np.degrees(_rms(values)):.3f}"
-
-
-def _mm(values: np.ndarray) -> str:
-    return f"{_rms(values) * 1e3:.1f}"

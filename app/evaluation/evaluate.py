@@ -101,23 +101,20 @@ def evaluate(
 
 
 def _measured(subject: Subject, sha256: str, outcomes: list[Outcome]) -> Evaluated:
-    truth = subject.truth
+    truth, described = subject.truth, ""
     outcomes, matched, problem = measure(outcomes, truth)
+    if truth is not None:  # the notes say whether a lever arm was removed
+        point = "" if any(truth.lever) else " of a point taken as the IMU's own (no lever arm)"
+        described = f"{truth.source}: {truth.kind}, {len(truth)} poses{point}."
     return Evaluated(
         name=subject.name,
         recording=subject.recording,
         sha256=sha256,
         outcomes=tuple(outcomes),
-        truth="" if truth is None else _described(truth),
+        truth=described,
         notes=() if truth is None else (matched.notes if matched else (problem,)),
         truth_path=_path(matched.trajectory, outcomes) if matched else None,
     )
-
-
-def _described(truth: TruePoses) -> str:
-    """The truth in words. The notes say whether a lever arm was removed."""
-    point = "" if any(truth.lever) else " of a point taken as the IMU's own (no lever arm)"
-    return f"{truth.source}: {truth.kind}, {len(truth)} poses{point}."
 
 
 def _path(truth: Trajectory, outcomes: Sequence[Outcome]) -> F64:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:  # who draws one needs nothing of the other
     from app.georeference.align import Alignment
 
 _HEIGHT = 300
+_CROSS = np.array([[-0.3, 0.3, 0, 0, 0], [0, 0, 0, 0.3, -0.3]])
+"""m, of a rejected fix."""
 _STYLE = (
     "<style>text{font:11px sans-serif;fill:#374151}.grid{stroke:#e5e7eb}.axis{font-weight:600}</style>"
     '<rect width="100%" height="100%" fill="white"/>'
@@ -48,7 +50,7 @@ def georeference_plot(alignment: "Alignment", positions: F64) -> str:
     lines = [
         Line("fixes that count", PALETTE[2], fixes[used, 0], fixes[used, 1], dashed=True),
         Line("path", PALETTE[0], path[:, 0], path[:, 1]),
-        *(_cross(place) for place in fixes[~used]),
+        *(Line("rejected", PALETTE[4], *(place[:2, None] + _CROSS)) for place in fixes[~used]),
     ]
     at = np.flatnonzero(used).astype(np.float64)
     over = [
@@ -81,9 +83,3 @@ def _before_and_after(both: F64, x_label: str, label: str) -> str:
         for name, colour, values in zip(("before", "after"), (PALETTE[4], PALETTE[0]), both, strict=True)
     ]
     return str(chart(lines, f"{x_label} (red before, blue after)", label, from_zero=True, height=_HEIGHT))
-
-
-def _cross(place: F64) -> Line:
-    """A rejected fix."""
-    east, north = place[0] + np.array([-0.3, 0.3, 0, 0, 0]), place[1] + np.array([0, 0, 0, 0.3, -0.3])
-    return Line("rejected", PALETTE[4], east, north)

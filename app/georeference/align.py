@@ -229,12 +229,12 @@ class _Problem:
         start = some._start(self.offset or 0.0)
         if self.offset is not None and free:
             few = some._part(_evenly(count))
-            fits = [_fit_robustly(few._errors, few._start(self.offset + nearby)) for nearby in NEARBY_S]
+            fits = [few._fit_robustly(few._start(self.offset + nearby)) for nearby in NEARBY_S]
             start = min(fits, key=lambda fit: float(fit.cost)).x
-        x, used = _robust(self._errors, start, self.overrides)
+        x, used = self._robust(start)
         R, shift, offset, arm = self._model(x)
         errors = self._errors(x)
-        J = _jacobian(lambda x: _with_level(self._errors(x)[used], x), x)
+        J = _jacobian(partial(self._whitened, used=used), x)
         spread = max(1.0, float((errors[used] ** 2).sum()) / max(3 * int(used.sum()) - len(x), 1))
         sigmas = _deviations(J) * spread**0.5
         return _Solved(
@@ -265,7 +265,7 @@ class _Problem:
     def with_drift(self, solved: _Solved) -> _Solved:
         """The same, with standard deviations that count drift, and constants of the receiver that it hardly pulls."""
         used, x, residuals = solved.used, solved.x, solved.residuals[solved.used]
-        J = _jacobian(lambda x: _with_level(self._errors(x)[used], x), x)
+        J = _jacobian(partial(self._whitened, used=used), x)
         sigmas, seconds = self.sigmas[used], self.seconds[used]
         influence = np.linalg.pinv(J).T[:-2].reshape(*residuals.shape, -1) / sigmas[..., None]
         drift = drift_deviations(residuals, influence, seconds)
@@ -304,10 +304,29 @@ class _Problem:
         R, shift, late, arm = self._model(x)
         return np.asarray((self.places - self.path.antenna(self.seconds - late, arm) @ R.T - shift) / self.sigmas)
 
+    def _whitened(self, x: F64, used: Mask) -> F64:
+        """(3 k + 2,) errors of the k fixes that are used, and the tilt among the unknowns, in standard deviations."""
+        return np.concatenate((self._errors(x)[used].ravel(), x[4:6] / LEVEL))
 
-def _with_level(errors: F64, x: F64) -> F64:
-    """Errors (n, 3) and the tilt among the unknowns, all in standard deviations, as (3 n + 2,)."""
-    return np.concatenate((errors.ravel(), x[4:6] / LEVEL))
+    def _fit_robustly(self, start: F64) -> Any:
+        """SciPy's result, by all fixes but those that the user leaves out."""
+        return _fit(self._whitened, start, loss="cauchy", f_scale=2.0, args=(self.overrides != 0,))
+
+    def _robust(self, start: F64) -> tuple[F64, Mask]:
+        """The optimum by the fixes that agree or that the user counts, and which these are."""
+        used = np.asarray(self.overrides != 0)
+        x = np.asarray(self._fit_robustly(start).x)
+        for _ in range(10):
+            distances = np.linalg.norm(self._errors(x), axis=1)
+            scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
+            agree = ((distances < MOST_SIGMAS * scale) | (self.overrides == 1)) & (self.overrides != 0)
+            if agree.sum() < 3:
+                break
+            x = np.asarray(_fit(self._whitened, x, args=(agree,)).x)
+            if (agree == used).all():
+                break
+            used = agree
+        return x, used
 
 
 def _deviations(J: F64) -> F64:
@@ -317,28 +336,6 @@ def _deviations(J: F64) -> F64:
     values, vectors = np.linalg.eigh((J / lengths).T @ (J / lengths))
     values = np.where(values > 1e-12, values, 1e-300)
     return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)) / lengths)
-
-
-def _fit_robustly(errors: Callable[[F64], F64], start: F64) -> Any:
-    """SciPy's result, by all fixes. errors: (n, 3) whitened."""
-    return _fit(lambda x: _with_level(errors(x), x), start, loss="cauchy", f_scale=2.0)
-
-
-def _robust(errors: Callable[[F64], F64], start: F64, overrides: F64) -> tuple[F64, Mask]:
-    """The optimum by the fixes that agree or that the user counts, and which these are. errors: (n, 3) whitened."""
-    used = np.asarray(overrides != 0)
-    x = np.asarray(_fit_robustly(lambda x: errors(x)[used], start).x)
-    for _ in range(10):
-        distances = np.linalg.norm(errors(x), axis=1)
-        scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
-        agree = ((distances < MOST_SIGMAS * scale) | (overrides == 1)) & (overrides != 0)
-        if agree.sum() < 3:
-            break
-        x = np.asarray(_fit(lambda x, w=agree: _with_level(errors(x)[w], x), x).x)
-        if (agree == used).all():
-            break
-        used = agree
-    return x, used
 
 
 def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:

@@ -58,9 +58,11 @@ class McapStream:
         Raises:
             EndOfFile: where the last piece is cut off, if messages up to `stop_ns` might have followed.
         """
-        for topic, kind, log_ns, encoding, data in self._records():
-            if topic in topics and start_ns <= log_ns < stop_ns:
-                yield topic, log_ns, self._deserialiser.read(data, kind, encoding)
+        added_ns, set_back = 0, dict(self.set_back)
+        for number, (topic, kind, log_ns, encoding, data) in enumerate(self._all_records()):
+            added_ns += set_back.get(number, 0)
+            if topic in topics and start_ns <= log_ns + added_ns < stop_ns:
+                yield topic, log_ns + added_ns, self._deserialiser.read(data, kind, encoding)
         if self._pieces[-1] in self.cut and stop_ns > self.end_ns:
             raise EndOfFile("the file ends here, in the middle of a record")
 
@@ -70,13 +72,6 @@ class McapStream:
     def _begin(self, piece: Path) -> int:
         """Log time of its first message; 0 without any."""
         return next((log_ns for _, _, log_ns, _, _ in self._records_of(piece)), 0)
-
-    def _records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
-        """With log times that go on where the clock was set back."""
-        added_ns, set_back = 0, dict(self.set_back)
-        for number, (topic, kind, log_ns, encoding, data) in enumerate(self._all_records()):
-            added_ns += set_back.get(number, 0)
-            yield topic, kind, log_ns + added_ns, encoding, data
 
     def _all_records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
         for piece in self._pieces:

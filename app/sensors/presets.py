@@ -1,6 +1,5 @@
 """Partial parameter trees for known devices, and the order in which settings override each other."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,49 +47,34 @@ metadata; the doctor shows that of a capture's unit. `hesai-xt`,
 a shaft)."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Appearance:
-    """What the clouds of a scanner with an IMU of its own look like.
-
-    Attributes:
-        kinds: types of message. fields: that they have among others. lines: numbers of scan lines; (): any.
-        lowest, highest: deg, bounds of the lowest and of the highest elevation.
-    """
-
-    kinds: tuple[str, ...]
-    fields: frozenset[str]
-    lines: tuple[int, ...]
-    lowest: tuple[float, float]
-    highest: tuple[float, float]
-
-    def fits(self, kind: str, probe: Probe) -> bool:
-        points, angles = probe.points, np.degrees(elevation(probe.points))
-        lowest, highest = np.percentile(angles, [0.5, 99.5])
-        around = np.histogram(np.arctan2(points[:, 1], points[:, 0]), 12, (-np.pi, np.pi))[0]
-        return (
-            kind in self.kinds
-            and self.fields <= probe.cloud.fields.keys()
-            and (not self.lines or int(probe.column("ring").max()) + 1 in self.lines)
-            and self.lowest[0] < lowest < self.lowest[1]
-            and self.highest[0] < highest < self.highest[1]
-            and bool(np.count_nonzero(around) > 8)
-        )
-
-
 _POINTS = (POINT_CLOUD_2.name,)
-_APPEARANCES = (
-    ("mid360", _Appearance(CUSTOM_MSGS, frozenset(), (), (-9, 90), (40, 56))),
-    ("mid360", _Appearance(_POINTS, frozenset({"tag", "line"}), (), (-9, 90), (40, 56))),
-    ("airy", _Appearance(_POINTS, frozenset({"ring", "timestamp"}), (96,), (-3, 20), (60, 91))),
-    ("jt128", _Appearance(_POINTS, frozenset({"ring", "timestamp"}), (128,), (-8, 20), (60, 91))),
-    ("ouster", _Appearance(_POINTS, frozenset({"ring", "t", "reflectivity"}), (32, 64, 128), (-90, 0), (0, 91))),
+_APPEARANCES: tuple[tuple[str, tuple[str, ...], set[str], tuple[int, ...], tuple[int, int], tuple[int, int]], ...] = (
+    ("mid360", CUSTOM_MSGS, set(), (), (-9, 90), (40, 56)),
+    ("mid360", _POINTS, {"tag", "line"}, (), (-9, 90), (40, 56)),
+    ("airy", _POINTS, {"ring", "timestamp"}, (96,), (-3, 20), (60, 91)),
+    ("jt128", _POINTS, {"ring", "timestamp"}, (128,), (-8, 20), (60, 91)),
+    ("ouster", _POINTS, {"ring", "t", "reflectivity"}, (32, 64, 128), (-90, 0), (0, 91)),
 )
-"""Of each preset; that of a scanner whose driver sends several types of message is listed for each."""
+"""What the clouds of scanners with an IMU of their own look like: preset; types of message; fields that they have among
+others; numbers of scan lines, () for any; bounds of the lowest and of the highest elevation, deg. All go all around."""
 
 
 def preset_for(kind: str, probe: Probe) -> str:
     """The preset of the scanner whose clouds are of this type and look like this one; "" if none is known."""
-    return next((name for name, appearance in _APPEARANCES if appearance.fits(kind, probe)), "")
+    points = probe.points
+    lowest, highest = np.percentile(np.degrees(elevation(points)), [0.5, 99.5])
+    around = np.histogram(np.arctan2(points[:, 1], points[:, 0]), 12, (-np.pi, np.pi))[0]
+    for name, kinds, fields, lines, (low_from, low_to), (high_from, high_to) in _APPEARANCES:
+        if (
+            kind in kinds
+            and fields <= probe.cloud.fields.keys()
+            and (not lines or int(probe.column("ring").max()) + 1 in lines)
+            and low_from < lowest < low_to
+            and high_from < highest < high_to
+            and np.count_nonzero(around) > 8
+        ):
+            return name
+    return ""
 
 
 def built_in_mounting(preset: str, imu_topic: str) -> dict[str, Any]:
