@@ -3,35 +3,56 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import viser
+
 from app.child import Child, Link
 from app.slam.errors import HemislamError
+from app.ui.widgets import add_button, show
 
 
 class Background:
-    """One piece of work at a time. A text among its messages says why it failed. name, title: as in `Child`."""
+    """One piece of work at a time, with a bar that shows its share and a button that ends it.
 
-    def __init__(self, name: str, title: str) -> None:
+    A text among its messages says why it failed; a number is the share that is done.
+
+    Args:
+        name, title: as in `Child`. hint: of the button.
+    """
+
+    def __init__(self, gui: viser.GuiApi, name: str, title: str, hint: str | None = None) -> None:
         self._name, self._title = name, title
         self._child: Child | None = None
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._stop = add_button(gui, "Stop", lambda _: self.stop(), viser.Icon.PLAYER_STOP, visible=False, hint=hint)
 
     @property
     def running(self) -> bool:
         return self._child is not None
 
     def begin(self, main: Callable[..., None], *args: Any) -> None:
+        self.show(0.0)
         self._child = Child(_told, main, *args, name=self._name, title=self._title, fork=True, grace_s=0.0)
+        self._bar.visible = self._stop.visible = True
+
+    def show(self, share: float) -> None:
+        """Show how much is done, 0-1."""
+        show(self._bar, 100 * share)
 
     def messages(self) -> Iterator[Any]:
-        """Those that have come; no more once the work was stopped, by whatever thread."""
+        """Those that have come, but for shares; no more once the work was stopped, by whatever thread."""
         while (child := self._child) is not None:
             message = child.news()
             if message is None or child is not self._child:
                 return
-            yield message
+            if isinstance(message, float):
+                self.show(message)
+            else:
+                yield message
 
     def stop(self) -> None:
         """End the work, if there is any."""
         child, self._child = self._child, None
+        self._bar.visible = self._stop.visible = False
         if child is not None:
             child.close(0.0)
 

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import viser
-
 from app.calibration.calibrate import is_mounting_unknown
 from app.calibration.words import table, write_beside
 from app.child import Link
@@ -22,7 +20,7 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.ui.background import Background
 from app.ui.html import panel
-from app.ui.widgets import Page, add_button, show
+from app.ui.widgets import Page, add_button
 
 _EXPLAINED = (
     "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and what each scan line gets "
@@ -60,20 +58,11 @@ class CalibrationPanel:
         self._page, self._unasked, self._resolve = page, unasked, resolve
         gui = page.gui
         self._button = add_button(gui, "Calibrate", lambda _: self._begin(), color=None, hint=_EXPLAINED, disabled=True)
-        self._stop = add_button(
-            gui,
-            "Stop",
-            lambda _: self.close(),
-            viser.Icon.PLAYER_STOP,
-            visible=False,
-            hint="What was found before stays.",
-        )
-        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._work = Background(gui, "calibrate", "Calibration", "What was found before stays.")
         self._html = gui.add_html("", visible=False)
         self._apply = add_button(gui, "Apply", lambda _: self._apply_or_undo(), color=None, visible=False)
         self._keep = add_button(gui, "Keep", lambda _: self._write(), hint=_KEEPS, visible=False)
         self._plot = gui.add_html("", visible=False)
-        self._work = Background("calibrate", "Calibration")
         self._found = FoundMounting([], {})
         self._before: dict[str, Any] = {}  # values that those found replaced; empty unless these are in use
         self._file: bytes | None = None  # the parameter file beside the recording, before it was written
@@ -99,22 +88,13 @@ class CalibrationPanel:
             self._announce()
         for message in self._work.messages():
             self._show(message)
-        self._show_running()
+        self._apply.disabled = self._keep.disabled = self._work.running
 
     def close(self) -> None:
         """End what is under way."""
         self._work.stop()
-        self._show_running()
-
-    def _show_running(self) -> None:
-        running = self._work.running
-        self._progress.visible = self._stop.visible = running
-        self._apply.disabled = self._keep.disabled = running
 
     def _show(self, message: Any) -> None:
-        if isinstance(message, float):
-            show(self._progress, 100 * message)
-            return
         self.close()
         found = message if isinstance(message, FoundMounting) else FoundMounting([("", message)], {})
         if found.contradiction:
@@ -159,12 +139,11 @@ class CalibrationPanel:
         recording, params = snapshot.recording.path, snapshot.params
         self._asked, self._tried, self._given = asked, True, params
         self._notified.clear()
-        show(self._progress, 0.0)
         try:
             self._work.begin(find, recording, self._uncalibrated(recording, params))
+            self._apply.disabled = self._keep.disabled = True
         except HemislamError as error:
             self._show(str(error))
-        self._show_running()
 
     def _uncalibrated(self, recording: Path, params: Params) -> Params:
         """These parameters without what was found in this recording before; else its walk would count twice."""

@@ -18,7 +18,7 @@ from app.ui.colours import DENSITY, DISTANCE, LOOK, MODES, TABLES, Limits, value
 from app.ui.files import FileList
 from app.ui.html import Tile, number, panel
 from app.ui.map_numbers import Density, MapNumbers
-from app.ui.widgets import Changes, Page, View, add_button, dialog, limited, show
+from app.ui.widgets import Changes, Page, View, add_button, dialog, limited
 
 _BINS: Final = 41
 _LEAST_M: Final = 0.005
@@ -37,10 +37,9 @@ class MapComparePanel:
     def __init__(self, page: Page, folders: Folders, results: Path, colour_by: Callable[[str], None]) -> None:
         gui = page.gui
         self._page, self._folders, self._results, self._colour_by = page, folders, results, colour_by
-        self._work = Background("compare", "The comparison")
         self._session, self._before = -1, LOOK  # the colour mode that distances replaced
         self._chunks: tuple[Chunk, ...] = ()  # that were compared last
-        self._name, self._share = "", 0.0
+        self._name = ""
         self._comparison: Comparison | None = None
         self._distance: MapNumbers | None = None
         self._density = Density(page.now)
@@ -60,8 +59,7 @@ class MapComparePanel:
                 "reach (m)", REACH_M, min=0.05, max=5.0, step=0.05, hint="What is farther has no counterpart."
             )
         )
-        self._progress = gui.add_progress_bar(0.0, visible=False)
-        self._stop = add_button(gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False)
+        self._work = Background(gui, "compare", "The comparison")
 
     def seen(self, current: Snapshot, view: View) -> View:
         """The view with the numbers that its colour mode needs."""
@@ -79,10 +77,8 @@ class MapComparePanel:
         running, recording = self._work.running, current.recording
         self._choose.disabled = self._truth.disabled = running or not current.chunks
         self._truth.visible = recording is not None and recording.truth is not None
-        self._progress.visible = self._stop.visible = running
         old = self._distance is not None and current.chunks is not self._chunks
-        if self._changes(self._comparison, old, int(100 * self._share)):
-            show(self._progress, 100 * self._share)
+        if self._changes(self._comparison, old):
             self._found.visible = self._comparison is not None
             if self._comparison is not None:
                 self._found.content = summary(self._comparison, self._name, [_OLD] if old else [])
@@ -122,14 +118,12 @@ class MapComparePanel:
         wanted = MapsToCompare(
             scans, other, by_truth, where, self._fit.value and not by_truth, float(self._reach.value)
         )
-        self._chunks, self._name, self._share = current.chunks, "the truth" if by_truth else other.name, 0.0
+        self._chunks, self._name = current.chunks, "the truth" if by_truth else other.name
         self._work.begin(find, wanted)
 
     def _receive(self) -> None:
         for message in self._work.messages():
             match message:
-                case float():
-                    self._share = message
                 case Comparison():
                     self.close()
                     self._comparison = message

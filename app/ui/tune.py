@@ -17,7 +17,7 @@ from app.ui.background import Background
 from app.ui.compare import Sides
 from app.ui.html import panel
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_button, show
+from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_button
 
 _PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
 _LEAST_S: Final = 5.0
@@ -43,7 +43,6 @@ class TunePanel:
     def __init__(self, page: Page, forks: Workspace, sides: Sides, folder: Path) -> None:
         gui = page.gui
         self._page, self._forks, self._sides, self._folder = page, forks, sides, folder
-        self._work = Background("tune", "The search")
         self._wanted: Wanted | None = None  # by the search that was started last
         self._found, self._chosen = Tried(), -1
         self._runs: list[tuple[float, int]] = []  # when how many runs had ended, since the last that took no time
@@ -65,13 +64,10 @@ class TunePanel:
         self._search = gui.add_dropdown("search", get_args(SearchMethod), hint="How the next trials are chosen.")
         self._trials = gui.add_slider("trials", 8, 400, 8, 48)
         self._start = add_button(gui, "Start", lambda _: self._begin(), viser.Icon.PLAYER_PLAY, color=None)
-        self._stop = add_button(
-            gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False, hint="Finished runs stay."
-        )
         self._go_on = add_button(
             gui, "Go on", lambda _: self._run(), viser.Icon.PLAYER_TRACK_NEXT, color=None, visible=False
         )
-        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._work = Background(gui, "tune", "The search", "Finished runs stay.")
         self._bridge = Bridge(gui, "trials", self._clicked)
         self._plots = gui.add_html("", visible=False)
 
@@ -84,7 +80,6 @@ class TunePanel:
         self._receive()
         running = self._work.running
         self._start.visible, self._start.disabled = not running, bool(problem)
-        self._stop.visible = self._progress.visible = running
         self._go_on.visible = not running and self._wanted is not None and not self._found.finished
         done = self._runs[-1][1] if self._runs else 0
         if self._changes(self._found, self._chosen, running, done, problem):
@@ -93,8 +88,7 @@ class TunePanel:
             html = maths.plots(self._found, objectives, self._chosen) if objectives else ""
             self._plots.content, self._plots.visible = self._bridge.live(html), bool(html)
             if self._wanted is not None:
-                share = 100 * done / (self._wanted.trials + 1)
-                show(self._progress, min(share, 100.0))
+                self._work.show(min(done / (self._wanted.trials + 1), 1.0))
 
     def close(self) -> None:
         """End what is under way; its finished runs stay."""

@@ -85,12 +85,12 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert process.arguments == (Path("walk.mcap"), Params())
     process.messages += [0.25, 0.5]
     panel.draw(OPEN)
-    assert panel._progress.visible and panel._progress.value == 50 and panel._button.disabled
+    assert panel._work._bar.visible and panel._work._bar.value == 50 and panel._button.disabled
     process.messages.append(
         FoundMounting([("rotation of the LiDAR on the IMU", "roll 70.00 ± 0.05 <deg>")], FOUND, "<svg/>")
     )
     panel.draw(OPEN)
-    assert process.closed and not panel._progress.visible and panel._apply.visible
+    assert process.closed and not panel._work._bar.visible and panel._apply.visible
     assert "roll 70.00 ± 0.05 &lt;deg&gt;" in panel._html.content and page.sent == []
     user_clicks(panel._apply)
     assert page.sent == [SetParams(FOUND), Restart(), Calibrated("")] and "<svg/>" in panel._plot.content
@@ -104,9 +104,9 @@ def test_it_can_be_stopped_and_what_was_applied_before_can_still_be_undone(page:
     page.draw(page.now)
     user_clicks(page.panel._button)
     process = page.process()
-    assert page.panel._stop.visible and page.panel._apply.disabled, "nothing is applied meanwhile"
-    user_clicks(page.panel._stop)
-    assert process.closed and not page.panel._stop.visible and not page.panel._progress.visible
+    assert page.panel._work._stop.visible and page.panel._apply.disabled, "nothing is applied meanwhile"
+    user_clicks(page.panel._work._stop)
+    assert process.closed and not page.panel._work._stop.visible and not page.panel._work._bar.visible
     page.draw(page.now)
     assert not page.panel._button.disabled
     assert page.panel._apply.label == "Undo" and page.panel._apply.visible and not page.panel._apply.disabled

@@ -73,10 +73,10 @@ def test_the_map_is_coloured_when_the_comparison_has_come(comparing: Comparing) 
     (wanted,) = comparing.process.arguments
     assert wanted.by_truth and wanted.other == Path("walk_truth.tum") and len(wanted.scans) == 2
     comparing.draw(0.4)
-    assert comparing.panel._progress.visible and comparing.panel._progress.value == pytest.approx(40)
+    assert comparing.panel._work._bar.visible and comparing.panel._work._bar.value == pytest.approx(40)
     assert comparing.panel._choose.disabled
     comparing.draw(FOUND)
-    assert comparing.modes == [DISTANCE] and not comparing.panel._progress.visible
+    assert comparing.modes == [DISTANCE] and not comparing.panel._work._bar.visible
     assert "the truth" in comparing.panel._found.content and "<svg" in comparing.panel._found.content
     view = comparing.panel.seen(NOW, View(colour_by=DISTANCE))
     assert view.numbers is not None and view.numbers.limits == Limits(-0.02, 0.02)
@@ -87,9 +87,9 @@ def test_the_map_is_coloured_when_the_comparison_has_come(comparing: Comparing) 
 def test_stop_ends_it_and_a_problem_is_reported(comparing: Comparing) -> None:
     user_clicks(comparing.panel._truth)
     process = comparing.process
-    user_clicks(comparing.panel._stop)
+    user_clicks(comparing.panel._work._stop)
     comparing.draw()
-    assert process.closed and comparing.process is None and not comparing.panel._progress.visible
+    assert process.closed and comparing.process is None and not comparing.panel._work._bar.visible
     user_clicks(comparing.panel._truth)
     comparing.draw("The maps do not lie on each other.")
     assert comparing.process is None and comparing.modes == []
@@ -99,8 +99,8 @@ def fail(owner: Link, why: str) -> None:
     raise HemislamError(why)
 
 
-def test_work_that_cannot_be_done_says_why() -> None:
-    work, found = background.Background("test", "The test"), None
+def test_work_that_cannot_be_done_says_why(server: viser.ViserServer) -> None:
+    work, found = background.Background(server.gui, "test", "The test"), None
     work.begin(fail, "The file cannot be read.")
     deadline = time.monotonic() + 60
     while found is None and time.monotonic() < deadline:

@@ -85,7 +85,7 @@ def test_a_search_is_of_the_part_that_is_looked_at_and_shows_its_trials_and_the_
     tuning.draw(Ended(5, True))
     tuning.draw(Ended(9, True), Tried(TRIALS, (3,), {"ground.sigma": 0.8, "ground.alpha": 0.2}))
     assert tuning.says("4 of 49 trials · 100 s left") or tuning.says("4 of 49 trials · 2 min left")
-    assert panel._progress.visible and panel._progress.value == pytest.approx(100 * 9 / 49)
+    assert panel._work._bar.visible and panel._work._bar.value == pytest.approx(100 * 9 / 49)
     html = panel._plots.content
     assert html.count('data-hs="trial 3"') == 3  # in the table, over trials, and as a line
     assert 'data-hs="trial 2"' not in html, "a trial without a score lies nowhere"
@@ -96,7 +96,7 @@ def test_a_search_that_is_stopped_goes_on_with_the_same_settings(tuning: Tuning)
     user_clicks(tuning.panel._start)
     first = tuning.process
     tuning.draw(Tried(TRIALS, (3,)))
-    user_clicks(tuning.panel._stop)
+    user_clicks(tuning.panel._work._stop)
     tuning.draw()
     assert first.closed and tuning.says("stopped") and tuning.panel._go_on.visible
     tuning.now = replace(OPEN, params=OPEN.params.with_values({"ground.alpha": 11.0}))
