@@ -1,5 +1,6 @@
 """What `hemislam evaluate` does: plan the runs, run them, measure them, report."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from app.evaluation.runner import RunJobs
 from app.evaluation.truth import TruePoses, check_overlap
 from app.evaluation.variants import Variant
 from app.sensors.recording import open_recording
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.provenance import sha256_of
 from app.slam.trajectory import Trajectory
@@ -36,13 +38,15 @@ class Subject:
     marks: tuple[tuple[int, bytes], ...] = ()
 
 
-def check_subject(subject: Subject) -> str:
-    """The hash of its recording.
+def check_subject(subject: Subject, start_s: float = 0.0) -> str:
+    """The hash of its recording. start_s: of the part that is asked for.
 
     Raises:
-        HemislamError: the recording cannot be used, or its truth is from another time.
+        HemislamError: the recording cannot be used or ends before that part, or its truth is from another time.
     """
     with open_recording(subject.recording, subject.params) as recording:
+        if start_s >= recording.duration_s:
+            raise HemislamError(recording.nothing_usable(Counter(), start_s, None))
         if subject.truth is not None:
             check_overlap(subject.truth, recording.start_ns, recording.duration_s)
     return sha256_of(subject.recording)
@@ -72,7 +76,7 @@ def evaluate(
     jobs: dict[tuple[str, str], Job] = {}
     hashes: dict[str, str] = {}
     for subject in subjects:
-        hashes[subject.name] = digest = check_subject(subject)
+        hashes[subject.name] = digest = check_subject(subject, start_s)
         for variant in variants:
             jobs[subject.name, variant.name] = Job(
                 recording=subject.recording,

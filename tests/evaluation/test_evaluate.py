@@ -204,6 +204,7 @@ def test_two_variants_of_one_name_and_misspelt_parameters_are_refused() -> None:
         (["RECORDING", "--compare", "theirs.tum"], "NAME=FILE"),
         (["RECORDING", "--compare", "Ours=theirs.tum"], "a column Ours exists already"),
         (["RECORDING", "--short"], "--duration shortens it"),
+        (["RECORDING", "--start", "10000"], "has no scan after 10000 s; it lasts"),
         (["RECORDING", "--truth", "topic:/odom"], "no topic /odom"),
         (["RECORDING", "--truth", "a", "--truth", "b"], "2 --truth options for 1 recordings"),
     ],
