@@ -1,6 +1,7 @@
 """`hemislam compare`: how far one map lies from another."""
 
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -58,6 +59,11 @@ def _check(out: Path, *maps: Path) -> None:
     """Refuse, before the work, what cannot be written or would replace what is compared."""
     if out.is_dir() or not out.parent.is_dir():
         raise HemislamError(f"{out} cannot be written; choose a file in a folder that exists as --out.")
+    try:
+        with NamedTemporaryFile(dir=out.parent):
+            pass
+    except OSError as error:
+        raise HemislamError(f"{out} cannot be written ({error.strerror}); choose another file as --out.") from None
     if out.resolve() in {(path / "map.ply" if path.is_dir() else path).resolve() for path in maps}:
         raise HemislamError(f"{out} is a map to compare; choose another file as --out.")
 

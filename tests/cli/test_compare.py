@@ -74,6 +74,8 @@ def test_a_comparison_replaces_no_map_and_needs_a_folder_that_exists(
         (tmp_path, "cannot be written"),
     ):
         assert says in hemislam("compare", results, other, "--out", out).refused()
+    refused = hemislam("compare", "nothing.ply", other, "--out", "/proc/apart.ply").refused()
+    assert "/proc/apart.ply cannot be written (" in refused, "before the maps are read"
 
 
 @pytest.fixture(scope="module")
