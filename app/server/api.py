@@ -122,7 +122,7 @@ def _add_actions(
 
 # --- other bodies --------------------------------------------------------------------------------
 class NoteBody(_Body):
-    text: str = Field(min_length=1, max_length=1000)
+    text: str = Field(min_length=1, max_length=1000, pattern=r"^[^\x00]*$")
 
 
 class OpenBody(_Body):
@@ -305,7 +305,7 @@ def _save(engine: RunningEngine, folder: Path, formats: tuple[str, ...]) -> None
         for saved in snapshot.saved:
             if saved.folder == folder:
                 if saved.error:
-                    raise HTTPException(500, saved.error)
+                    raise HTTPException(409 if saved.mendable else 500, saved.error)
                 return
         if not snapshot.engine_alive:
             raise HTTPException(503, "The engine's process ended while it was saving.")

@@ -225,11 +225,12 @@ class Controller:
             command, save = self._saves.popleft()
             self._share = 0.0
             error = save.exception()
-            if error is not None and not isinstance(error, HemislamError):
+            mendable = error is None or isinstance(error, HemislamError)
+            if not mendable:
                 log.error("Saving to %s failed", command.folder, exc_info=error)
             self._show_share(None)
             why = "" if error is None else str(error) or type(error).__name__
-            self._page.saved(protocol.Saved(command.folder, why, command.fetched))
+            self._page.saved(protocol.Saved(command.folder, why, command.fetched, mendable))
         if self._saves:
             self._show_share(self._share)
         if self._opening is not None:

@@ -239,11 +239,16 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Saved:
-    """A `Save` that has ended. error: why it failed; "" if it did not. fetched: as in `Save`."""
+    """A `Save` that has ended.
+
+    Attributes:
+        error: why it failed; "" if it did not. mendable: by the user. fetched: as in `Save`.
+    """
 
     folder: Path
     error: str = ""
     fetched: bool = False
+    mendable: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,6 +72,8 @@ def test_exports_by_rest(site: Site) -> None:
     for name in ("trajectory.gpx", "map.kmz"):
         refused = httpx.get(site.url(f"/api/export/{name}"))
         assert refused.status_code == 409 and "needs a georeferenced map" in refused.json()["detail"]
+    refused = httpx.get(site.url("/api/export/section.svg"), timeout=TIMEOUT_S)
+    assert refused.status_code == 409 and "box" in refused.json()["detail"]
     without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=TIMEOUT_S)
     assert without_loops.status_code == 404 and "loop search is off" in without_loops.json()["detail"]
 
@@ -161,6 +163,7 @@ def test_a_note_stays_with_its_frame(site: Site) -> None:
         assert time.monotonic() < deadline
     assert notes[-1] == {"frame": 9, "text": "the door opens"}
     assert httpx.post(site.url("/api/notes"), json={"text": ""}).status_code == 422
+    assert httpx.post(site.url("/api/notes"), json={"text": "a\0b"}).status_code == 422
     assert httpx.post(site.url("/api/notes"), json={"text": "a door", "frame": 3}).status_code == 422
     there = f"/api/notes/{len(notes) - 1}"
     assert httpx.put(site.url(there), json={"text": "it closes"}).status_code == 202
