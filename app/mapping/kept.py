@@ -3,12 +3,11 @@
 from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
-from pydantic import PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import Field, PlainSerializer, PlainValidator, TypeAdapter
 
 from app.export.box import Box
 from app.mapping.painted import Stroke, entry_of, stroke_of
 from app.slam.errors import HemislamError
-from app.slam.types import Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +18,9 @@ class Note:
     text: str
 
 
-KeptView = tuple[Vector, Vector]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Place = tuple[Finite, Finite, Finite]
+KeptView = tuple[Place, Place]
 """Where a camera stands and what it looks at, (x, y, z) each, m, in the map."""
 
 
@@ -28,7 +29,7 @@ class Spot:
     """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
 
     keyframe: int
-    at: Vector
+    at: Place
 
 
 @dataclass(frozen=True, slots=True)

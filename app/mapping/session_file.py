@@ -35,7 +35,7 @@ from pydantic import (
 from app import __version__
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.kept import Clip, Kept
+from app.mapping.kept import Clip, Finite, Kept, KeptView, Measure
 from app.mapping.labels import LabelEdit
 from app.mapping.painted import marks, read_json
 from app.slam.errors import HemislamError
@@ -51,11 +51,10 @@ SUFFIX = ".hemislam"
 FORKS, FORK_START = "forks", f"start{SUFFIX}"
 """Below the folder of session files, folders of forks; and in each the file that the fork began with."""
 FORMAT = 2
+_MOST_OF_NAME = 200
+"""Bytes of a recording's name that its session file has; file systems take 255 in all."""
 MOST_POINTS = 1 << 24
 """Of a keyframe: far more than any scan has."""
-
-
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +66,8 @@ class Opened:
     """
 
     recording: Path
-    start_s: _Finite = 0.0
-    duration_s: _Finite | None = None
+    start_s: Finite = 0.0
+    duration_s: Finite | None = None
     nbytes: int = 0
 
 
@@ -128,7 +127,13 @@ class State(Kept):
     calibration: str = ""
 
 
-_OPENED, _STATE, _CLIP = TypeAdapter(Opened), TypeAdapter(State), TypeAdapter(Clip)
+_OPENED, _STATE = TypeAdapter(Opened), TypeAdapter(State)
+_SHOWN: Mapping[str, tuple[str, TypeAdapter[Any]]] = {
+    "clip": ("clip box and slab", TypeAdapter(Clip)),
+    "views": ("kept views", TypeAdapter(tuple[KeptView, ...])),
+    "measures": ("measures", TypeAdapter(tuple[Measure, ...])),
+}
+"""Parts of a state that decide no result, and their names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +227,8 @@ class SessionWriter:
 
 def new_path(folder: Path, recording: Path) -> Path:
     """A name for the session file of a recording, in the order of time."""
-    return free_path(folder / f"{recording.stem}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
+    stem = recording.stem.encode()[:_MOST_OF_NAME].decode(errors="ignore")
+    return free_path(folder / f"{stem}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
 
 
 def write_session(path: Path, session: SavedSession) -> None:
@@ -278,13 +284,16 @@ def read_session(path: Path) -> SavedSession:
 
 
 def _state_of(entry: Mapping[str, Any]) -> tuple[State, str]:
-    """The state in a line, and what was left out of it, as in `SavedSession`: what is shown decides no result."""
-    try:
-        _CLIP.validate_python(entry.get("clip", {}))
-    except (HemislamError, ValidationError) as error:
-        rest = {name: value for name, value in entry.items() if name != "clip"}
-        return _STATE.validate_python(rest), f"The session's clip box and slab were left out ({_why(error)})."
-    return _STATE.validate_python(entry), ""
+    """The state in a line, and what was left out of it, as in `SavedSession`: what is only shown and cannot be."""
+    entry, left_out = dict(entry), []
+    for name in _SHOWN.keys() & entry.keys():
+        what, adapter = _SHOWN[name]
+        try:
+            adapter.validate_python(entry[name])
+        except (HemislamError, ValidationError) as error:
+            del entry[name]
+            left_out.append(f"The session's {what} were left out ({_why(error)}).")
+    return _STATE.validate_python(entry), " ".join(sorted(left_out))
 
 
 def _why(error: Exception) -> str:

@@ -149,6 +149,30 @@ def test_a_clip_that_cannot_be_is_left_out_with_a_sentence(saved: SavedSession, 
     assert replace(read, left_out="") == saved
 
 
+@pytest.mark.parametrize(
+    ("name", "says", "wrong"),
+    [
+        ("views", "kept views were left out (", [[[0, 0, math.nan], [1, 1, 1]]]),
+        (
+            "measures",
+            "measures were left out (",
+            [{"name": "door", "spots": [{"keyframe": 0, "at": [0, math.inf, 0]}]}],
+        ),
+    ],
+)
+def test_places_that_are_nowhere_are_left_out_with_a_sentence(
+    saved: SavedSession, tmp_path: Path, name: str, says: str, wrong: Any
+) -> None:
+    path = tmp_path / "a.hemislam"
+    write_session(path, saved)
+    head, entry = map(json.loads, path.read_text().splitlines())
+    entry["state"][name] = wrong
+    path.write_text(f"{json.dumps(head)}\n{json.dumps(entry)}\n")
+    read = read_session(path)
+    assert says in read.left_out and getattr(read.state, name) == ()
+    assert read.state.notes == saved.state.notes and read.state.clip == saved.state.clip
+
+
 NOTES = [{"notes": [["x", "late"]]}, {"notes": [[1, None]]}]
 
 
@@ -236,6 +260,15 @@ class Kept(Bench):
         path = self.see().session_file
         assert path is not None
         return path
+
+
+def test_a_recording_has_a_session_file_however_long_its_name_is(tmp_path: Path) -> None:
+    path = tmp_path / f"{'w' * 250}.mcap"
+    path.symlink_to(SAMPLE)
+    bench = Kept(tmp_path / "sessions", path)
+    assert read_session(bench.session_file).opened.recording == SAMPLE.resolve()
+    assert not [notice for notice in bench.see().notices if notice.level == "error"]
+    bench.controller.close()
 
 
 VIEW = ((1.0, 2.0, 30.5), (0.0, 0.0, 0.0))
