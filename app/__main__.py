@@ -22,7 +22,7 @@ from app.cli.replay import replay
 from app.cli.run import run
 from app.cli.serve import serve
 from app.cli.tune import tune
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, refusal
 
 LEAST_MEMORY = 900 << 20
 """Bytes of addresses that numba, its threads and a walk take."""
@@ -56,8 +56,7 @@ def _of_the_machine(error: Exception) -> str | None:
     if isinstance(error, MemoryError) or "can't start new thread" in str(error):
         return "There is not enough memory; close other programs, or raise the limit (ulimit -v)."
     if isinstance(error, OSError):
-        where = f" ({error.filename})" if error.filename else ""
-        return f"The system refused: {error.strerror or error}{where}; check space, permissions and limits (ulimit -a)."
+        return refusal(error)
     return None
 
 

@@ -35,12 +35,10 @@ def replay(
       hemislam replay runs/sessions/walk-20261121-101500.hemislam
       hemislam replay session.hemislam --to-end --out results/walk
     """
-    from app.cli.run import free_folder, save
-    from app.export.exports import prepare_folder
+    from app.cli.run import free_folder, results_folder, save
 
     folder = out or free_folder(session)
-    prepare_folder(folder, replace=force)
-    with repeat(session, to_end=to_end) as (work, stop):
+    with results_folder(folder, replace=force), repeat(session, to_end=to_end) as (work, stop):
         save(work, folder, stop, replace=force)
 
 

@@ -66,7 +66,6 @@ def run(
       hemislam run walk.mcap --loops edits.yaml
     """
     from app.evaluation.truth import check_poses
-    from app.export.exports import prepare_folder
     from app.mapping.opening import open_session
     from app.slam.doubts import doubts
     from app.slam.loops import edit_files
@@ -89,26 +88,41 @@ def run(
             session.compare_with(truth)
         elif truth_path:
             typer.echo(f"Using the truth beside the recording: {truth_path}")
-        prepare_folder(folder, replace=force)
-        for finding in session.findings:
-            if finding.verdict != "fine":
-                typer.echo(f"{finding.verdict}: {finding.subject}: {finding}")
-        compile_behind_bar()
-        if session.loops:
-            session.loops.only_results()
-        if edits:
-            session.edit_loops(edits)
-        stop = process(session)
-        if session.frame < 0:
-            with contextlib.suppress(OSError):
-                folder.rmdir()  # only if it is empty
-            raise stop or HemislamError(_nothing_processed(session))
-        if calibrate and not advised and doubts(session.log, session.log.stamps_ns):  # a pause is no cause
-            advised = look_for_mounting(recording, params)
-        session.calibration = advised
-        save(session, folder, stop, replace=force)
+        with results_folder(folder, replace=force):
+            for finding in session.findings:
+                if finding.verdict != "fine":
+                    typer.echo(f"{finding.verdict}: {finding.subject}: {finding}")
+            compile_behind_bar()
+            if session.loops:
+                session.loops.only_results()
+            if edits:
+                session.edit_loops(edits)
+            stop = process(session)
+            if session.frame < 0:
+                raise stop or HemislamError(_nothing_processed(session))
+            if calibrate and not advised and doubts(session.log, session.log.stamps_ns):  # a pause is no cause
+                advised = look_for_mounting(recording, params)
+            session.calibration = advised
+            save(session, folder, stop, replace=force)
     finally:
         session.close()
+
+
+@contextlib.contextmanager
+def results_folder(folder: Path, *, replace: bool) -> Iterator[None]:
+    """While results are made for a folder: one that is empty in the end, since there are none, is removed.
+
+    Raises:
+        HemislamError: as `prepare_folder`.
+    """
+    from app.export.exports import prepare_folder
+
+    prepare_folder(folder, replace=replace)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # only if it is empty
 
 
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:

@@ -10,6 +10,7 @@ from app.sensors.livox import CUSTOM_MSGS
 from app.sensors.rings import elevation
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.text_files import is_file
 
 _H2LID_MOUNT = {"translation": [0.0175, 0.0276, -0.1083], "rotation": [0.0, 0.0, 0.0]}
 
@@ -99,8 +100,8 @@ def uncalibrated(recording: Path) -> Path | None:
     path = sidecar(recording)
     old, first = path.with_name(f"{path.name}.old"), _first_line(path)
     if first.startswith(MERGED):
-        return old if old.is_file() else path
-    return path if path.is_file() and not first.startswith(CALIBRATED) else None
+        return old if is_file(old) else path
+    return path if is_file(path) and not first.startswith(CALIBRATED) else None
 
 
 def calibrated_beside(recording: Path) -> str:
@@ -141,7 +142,7 @@ def resolve_params(
         params = params.merged(PRESETS[preset])
     if recording is not None:
         beside = sidecar(recording) if calibrated else uncalibrated(recording)
-        if beside is not None and beside.is_file():
+        if beside is not None and is_file(beside):
             params = _with_file(params, beside)
     if config is not None:
         params = _with_file(params, config)

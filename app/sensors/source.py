@@ -21,6 +21,7 @@ from app.sensors.ouster import OusterStream, metadata_beside
 from app.sensors.ros import Deserialiser
 from app.sensors.unpacking import limit_rosbags
 from app.slam.errors import HemislamError, printable, quoted
+from app.slam.text_files import is_file
 
 _COMPRESSED = (".zst", ".zstd")
 SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
@@ -246,7 +247,7 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
 def _write_ahead_logs(path: Path) -> list[Path]:
     """The -wal files of SQLite, beside a database or in a folder, that are not empty."""
     found = sorted(path.glob("*.db3-wal")) if path.is_dir() else [path.with_name(f"{path.name}-wal")]
-    return [wal for wal in found if wal.is_file() and wal.stat().st_size]
+    return [wal for wal in found if is_file(wal) and wal.stat().st_size]
 
 
 def _in_file_order(path: Path, files: list[Path]) -> McapStream | None:

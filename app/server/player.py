@@ -14,7 +14,7 @@ from app.mapping.session import EFFECT, Session
 from app.server.protocol import Progress
 from app.server.publisher import Publisher, opened_recording
 from app.slam.doubts import IN_DOUBT, doubts
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, refusal
 from app.slam.map_frame import NO_PAUSES
 from app.slam.types import DroppedScan, StepResult
 
@@ -211,6 +211,8 @@ class Player:
         """Report an error and pause."""
         if isinstance(error, HemislamError):
             reason = str(error)
+        elif isinstance(error, OSError):
+            reason = refusal(error)
         else:
             log.error("%s", what, exc_info=error)
             reason = f"{type(error).__name__}: {error}"

@@ -18,6 +18,12 @@ def quoted(path: Path) -> str:
     return shlex.quote(str(path))
 
 
+def refusal(error: OSError) -> str:
+    """What the system would not do, in a sentence."""
+    where = f" ({error.filename})" if error.filename else ""
+    return f"The system refused: {error.strerror or error}{where}; check space, permissions and limits (ulimit -a)."
+
+
 class HemislamError(Exception):
     """Something that the user gave cannot be used.
 

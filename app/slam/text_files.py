@@ -23,6 +23,13 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
     return next(path for name in names if not (path := stem.with_name(f"{stem.name}{name}{suffix}")).exists())
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file: none has a name that is too long for the file system."""
+    with contextlib.suppress(OSError):
+        return path.is_file()
+    return False
+
+
 def make_folder(folder: Path) -> None:
     """Raises HemislamError if the folder cannot be created."""
     try:

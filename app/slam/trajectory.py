@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
+from app.slam.text_files import is_file
 from app.slam.types import F64, I64
 from app.slam.user_text import as_numbers, read_rows
 
@@ -117,7 +118,7 @@ def truth_beside(recording: Path) -> Path | None:
     """The truth file beside a recording, `<name>_truth.tum`, if there is one."""
     name = recording.name if recording.is_dir() else recording.stem
     truth = recording.with_name(f"{name}_truth.tum")
-    return truth if truth.is_file() else None
+    return truth if is_file(truth) else None
 
 
 def time_apart(source: Path | str, stamps_ns: I64, begin_ns: int, duration_s: float) -> str:

@@ -15,7 +15,7 @@ import viser
 from app.export.box import Box
 from app.server.protocol import Command, Snapshot
 from app.slam import lie
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, refusal
 from app.slam.types import F64
 from app.ui.colours import LOOK, Limits
 from app.ui.map_numbers import MapNumbers
@@ -219,8 +219,8 @@ def notify_error(client: viser.ClientHandle, error: object) -> None:
 def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
     """Calls `act` in a thread with the new value and the browser, and only when a person changed it.
 
-    A HemislamError that it raises is shown in that browser. viser also calls back when code sets a value. Sending those
-    on would make the page and the engine answer each other for ever.
+    What it raises as HemislamError or OSError is shown in that browser. viser also calls back when code sets a value.
+    Sending those on would make the page and the engine answer each other for ever.
 
     viser calls a coroutine the moment it receives the value, but a plain function later, from a thread. By then another
     value may be in the control, and would be taken for the one that was set.
@@ -231,6 +231,8 @@ def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
             act(value, client)
         except HemislamError as error:
             notify_error(client, error)
+        except OSError as error:
+            notify_error(client, refusal(error))
 
     async def callback(event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:

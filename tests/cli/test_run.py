@@ -13,11 +13,12 @@ from typer.testing import CliRunner
 from app.__main__ import cli
 from app.export.exports import BY_RUN
 from app.mapping.session import Session
-from app.mapping.session_file import Opened, SavedSession, State, size_of, write_session
+from app.mapping.session_file import Opened, SavedSession, State, new_path, size_of, write_session
 from app.sensors.presets import resolve_params
 from app.slam.errors import HemislamError
 from app.slam.metrics import ate
-from app.slam.trajectory import Trajectory, read_tum, write_tum
+from app.slam.params import Params
+from app.slam.trajectory import Trajectory, read_tum, truth_beside, write_tum
 
 Call = Callable[..., Any]
 RESULTS = sorted(export.name for export in BY_RUN)
@@ -261,3 +262,29 @@ def test_a_run_that_fails_before_its_first_frame_leaves_no_folder(
     outcome = run_with_trouble(monkeypatch, walk, tmp_path / "out", HemislamError("No."), after=0)
     assert outcome.exit_code == 2
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["run", "replay"])
+def test_interrupted_while_it_compiles_it_leaves_no_folder(
+    monkeypatch: pytest.MonkeyPatch, walk: Path, tmp_path: Path, command: str
+) -> None:
+    def press(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("app.slam.warmup.compile_kernels", press)
+    session = tmp_path / "a.hemislam"
+    write_session(session, SavedSession(Opened(walk, nbytes=size_of(walk)), State(Params()), 3))
+    outcome = CliRunner().invoke(
+        cli, [command, str(session if command == "replay" else walk), "--out", str(tmp_path / "out")]
+    )
+    assert outcome.exit_code == 130
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_whose_name_leaves_no_room_for_others_beside_it_is_mapped_all_the_same(
+    hemislam: Call, walk: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / f"{'w' * 250}.mcap"
+    path.symlink_to(walk)
+    assert hemislam("run", path, "--out", tmp_path / "out", "--duration", "2").code == 0
+    assert len(new_path(tmp_path, path).name.encode()) < 255 and truth_beside(path) is None

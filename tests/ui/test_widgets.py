@@ -4,6 +4,7 @@ Tests app/ui/widgets.py.
 """
 
 import ast
+import asyncio
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -72,6 +73,18 @@ def test_a_command_that_finds_nothing_to_do_says_so_where_it_was_given(server: v
     for callback in command._impl.trigger_cb:
         callback(viser.CommandEvent(client=client, client_id=0, target=command))
     assert told == ["There is no fork; fork first."]
+
+
+def test_what_the_system_refuses_is_shown_as_a_sentence(server: viser.ViserServer) -> None:
+    told: list[str] = []
+    client: Any = SimpleNamespace(add_notification=lambda _title, text, **_: told.append(text))
+
+    def act(_: object, __: object) -> None:
+        Path("n" * 300).exists()
+
+    event: Any = SimpleNamespace(client=client, target=SimpleNamespace(value=1))
+    asyncio.run(by_user(act)(event))
+    assert len(told) == 1 and told[0].startswith("The system refused: File name too long (nnn")
 
 
 def test_each_word_of_the_page_is_heard_once_however_late_the_threads_are(
