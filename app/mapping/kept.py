@@ -19,8 +19,8 @@ class Note:
 
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Place = tuple[Finite, Finite, Finite]
-KeptView = tuple[Place, Place]
+FiniteVector = tuple[Finite, Finite, Finite]
+KeptView = tuple[FiniteVector, FiniteVector]
 """Where a camera stands and what it looks at, (x, y, z) each, m, in the map."""
 
 
@@ -29,7 +29,7 @@ class Spot:
     """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
 
     keyframe: int
-    at: Place
+    at: FiniteVector
 
 
 @dataclass(frozen=True, slots=True)
