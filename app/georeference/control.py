@@ -10,7 +10,7 @@ from app.georeference.align import Alignment
 from app.georeference.fixes import Fixes
 from app.georeference.ground import Ground
 from app.georeference.reference import ELLIPSOIDAL
-from app.georeference.tables import NamedColumns
+from app.georeference.tables import NamedColumns, table_of
 from app.slam.arrays import F64, Mask
 from app.slam.errors import HemislamError
 from app.slam.metrics import umeyama
@@ -21,6 +21,11 @@ PICKS = ("name", "x", "y", "z")
 """Columns of the two tables."""
 LEAST_WIDTH = 0.02
 """Of control points beside the line through them, as a share of their length along it."""
+
+
+def control_table(text: str) -> NamedColumns:
+    """A table of control points. Raises HemislamError: it has no heading, or a row is cut."""
+    return table_of(text.splitlines(), "The table of control points", *CONTROL)
 
 
 def align_with_points(

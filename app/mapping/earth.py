@@ -10,11 +10,11 @@ import numpy as np
 from app.export.results import Results
 from app.georeference.align import Alignment, align
 from app.georeference.bend import bend
-from app.georeference.control import CONTROL, align_with_points
+from app.georeference.control import align_with_points, control_table
 from app.georeference.fixes import Fixes
 from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.survey import Survey
-from app.georeference.tables import read_fixes, table_of
+from app.georeference.tables import read_fixes
 from app.sensors.navsat import recorded_fixes
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -94,7 +94,7 @@ def _read(recording: Path, gnss: Path | None, near_ns: int, changed_ns: int) -> 
 
 def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool]) -> Alignment:
     """By the control points that were picked on keyframes so far."""
-    table = table_of(survey.control.splitlines(), "The table of control points", *CONTROL)
+    table = control_table(survey.control)
     picked = {}
     for pick in survey.picks:
         if 0 <= pick.keyframe < len(results.keyframes):

@@ -118,7 +118,7 @@ class Curve:
     points_over: int
 
 
-def curve(result: StepResult | None, sigma: float, most: int = MOST_POINTS) -> Curve:
+def curve(result: StepResult | None, sigma: float) -> Curve:
     """Of one frame; without points where it has no plane."""
     numbers = point_numbers(result.cloud.points, result) if result is not None else None
     if numbers is None or not np.isfinite(numbers.distance).all() or not len(numbers.range):
@@ -130,7 +130,8 @@ def curve(result: StepResult | None, sigma: float, most: int = MOST_POINTS) -> C
     farthest = max(_LEAST_M, 1.15 * float(np.percentile(numbers.range[under], 98)) if under.any() else 10.0)
     shown = np.flatnonzero((numbers.range < farthest) & (distance < HEADROOM * sigma * farthest))
     shown = shown[np.argsort(numbers.range[shown], kind="stable")]
-    shown = shown[np.unique(np.arange(min(len(shown), most)) * len(shown) // max(min(len(shown), most), 1))]
+    count = min(len(shown), MOST_POINTS)
+    shown = shown[np.arange(count) * len(shown) // max(count, 1)]
     cm = 100 * distance[shown]
     # The two ends belong to the threshold's line alone.
     return Curve(
