@@ -43,7 +43,7 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
 from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
-from app.slam.text_files import free_path, make_folder, write_texts
+from app.slam.text_files import free_path, make_folder, shortened, write_texts
 
 log = logging.getLogger(__name__)
 
@@ -51,8 +51,6 @@ SUFFIX = ".hemislam"
 FORKS, FORK_START = "forks", f"start{SUFFIX}"
 """Below the folder of session files, folders of forks; and in each the file that the fork began with."""
 FORMAT = 2
-_MOST_OF_NAME = 200
-"""Bytes of a recording's name that its session file has; file systems take 255 in all."""
 MOST_POINTS = 1 << 24
 """Of a keyframe: far more than any scan has."""
 
@@ -227,8 +225,7 @@ class SessionWriter:
 
 def new_path(folder: Path, recording: Path) -> Path:
     """A name for the session file of a recording, in the order of time."""
-    stem = recording.stem.encode()[:_MOST_OF_NAME].decode(errors="ignore")
-    return free_path(folder / f"{stem}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
+    return free_path(folder / f"{shortened(recording.stem)}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
 
 
 def write_session(path: Path, session: SavedSession) -> None:

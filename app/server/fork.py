@@ -30,7 +30,7 @@ from app.server.protocol import Command, CompareWith, Pause, Play, Seek, SetBrea
 from app.server.setup import Seen, Setup
 from app.server.worker import RunningEngine
 from app.slam.errors import HemislamError
-from app.slam.text_files import free_path
+from app.slam.text_files import free_path, shortened
 
 MAIN = "main"
 PERIOD_S = 0.02
@@ -218,7 +218,7 @@ class Workspace:
             if session_file is None or self._setup.session_folder is None:
                 raise HemislamError("B has no session file.")
             session = read_session(session_file)
-            stem = f"{session.opened.recording.stem}-{_plain(name.strip() or b.name)}"
+            stem = f"{shortened(session.opened.recording.stem)}-{_plain(name.strip() or b.name)}"
             path = free_path(self._setup.session_folder / stem, SUFFIX)
             try:
                 write_session(path, session)

@@ -4,10 +4,14 @@ import contextlib
 import csv
 import io
 import itertools
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from app.slam.errors import HemislamError
+
+_LONGEST = 180
+"""Bytes of a name to which more is added; file systems take 255."""
 
 
 def csv_text(*rows: Iterable[object]) -> str:
@@ -21,6 +25,13 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
     """The first of STEM, STEM-2, STEM-3, ... that does not exist, with the suffix. always_numbered: from STEM-1 on."""
     names = (f"-{number}" if number > 1 or always_numbered else "" for number in itertools.count(1))
     return next(path for name in names if not (path := stem.with_name(f"{stem.name}{name}{suffix}")).exists())
+
+
+def shortened(name: str) -> str:
+    """A name, without its end where that leaves no room in the name of a file for what is added to it."""
+    while len(os.fsencode(name)) > _LONGEST:
+        name = name[:-1]
+    return name
 
 
 def is_file(path: Path) -> bool:

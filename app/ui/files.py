@@ -15,6 +15,7 @@ from app.mapping.session_file import SUFFIX, SavedSession
 from app.server.folders import RECORDINGS, TRAJECTORIES, FolderEntry, Folders
 from app.server.protocol import CompareWith, OpenRecording, Restart, Save, Snapshot
 from app.slam.errors import HemislamError
+from app.slam.text_files import shortened
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
 from app.ui.nodes import clear
@@ -54,7 +55,7 @@ def size_text(size: int) -> str:
 def result_folder_name(recording: Path, now: datetime) -> str:
     """`hall_bpearl-2026-05-01-134502`: sorts by recording, then by time; never overwrites an older run."""
     stem = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in recording.stem)
-    return f"{stem}-{now:%Y-%m-%d-%H%M%S}"
+    return f"{shortened(stem)}-{now:%Y-%m-%d-%H%M%S}"
 
 
 def last_saved(snapshot: Snapshot) -> Path | None:

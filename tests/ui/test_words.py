@@ -113,6 +113,8 @@ def test_a_name_that_is_none_for_a_folder_is_refused(typed: str) -> None:
 def test_result_folders_sort_and_need_no_quoting() -> None:
     now = datetime(2026, 5, 1, 13, 45, 2)
     assert result_folder_name(Path("/x/hall bpearl (1).mcap"), now) == "hall_bpearl__1_-2026-05-01-134502"
+    long = result_folder_name(Path(f"/x/{'ö' * 120}.mcap"), now)
+    assert folder_name(long) == long and long.endswith("ö-2026-05-01-134502")
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from app.sensors.live.pcap import Capture, CapturePlace, Datagram
 from app.sensors.live.status import Counters
 from app.sensors.robosense import Model
 from app.slam.errors import HemislamError, quoted
+from app.slam.text_files import is_file
 from app.slam.types import I64, Scan
 
 SUFFIXES = (".pcap", ".pcapng")
@@ -171,7 +172,7 @@ class CaptureStream(PacketStream):
         self._device = found or DEVICES["rsbpearl"]
         self._lidar_topic, self._imu_topic = self._device.layout.lidar_topic, self._device.layout.imu_topic
         self._topics = {Revolution: self._lidar_topic, ImuSample: self._imu_topic}
-        model, own = self._device.model, sidecar.is_file() and self._device.has_angles
+        model, own = self._device.model, is_file(sidecar) and self._device.has_angles
         self._decoder = Decoder(read_angles(sidecar) if own else None, model) if isinstance(model, Model) else None
         self._angles = f"from {sidecar.name}" if own else ""
         self._devices: list[tuple[int, Difop]] = []
