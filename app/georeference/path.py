@@ -22,6 +22,7 @@ class PathOverTime:
         self._times = (trajectory.stamps_ns - self.start_ns) * 1e-9
         self._places = make_interp_spline(self._times, trajectory.positions, k=3)
         self._turns = Slerp(self._times, trajectory.rotations)
+        self._asked: tuple[F64, F64, Rotation] | None = None
 
     def known(self, t: F64) -> Mask:
         """(n,) whether there are poses near these times."""
@@ -35,16 +36,23 @@ class PathOverTime:
 
     def poses(self, t: F64) -> F64:
         """(n, 4, 4) T_map_imu."""
-        inside = np.clip(t, self._times[0], self._times[-1])
+        places, turns = self._at(t)
         T = np.tile(np.eye(4), (len(t), 1, 1))
-        T[:, :3, :3], T[:, :3, 3] = self._turns(inside).as_matrix(), self._places(inside)
+        T[:, :3, :3], T[:, :3, 3] = turns.as_matrix(), places
         return T
 
     def antenna(self, t: F64, lever: F64) -> F64:
         """(n, 3) m in the map, of a point `lever` (3,) in the IMU frame."""
-        inside = np.clip(t, self._times[0], self._times[-1])
-        turns: Rotation = self._turns(inside)
-        return np.asarray(self._places(inside) + turns.apply(lever))
+        places, turns = self._at(t)
+        return np.asarray(places + turns.apply(lever))
+
+    def _at(self, t: F64) -> tuple[F64, Rotation]:
+        """Places (n, 3) and attitudes. Kept until other times are asked for: most steps of a fit ask for the same."""
+        asked = self._asked
+        if asked is None or not np.array_equal(asked[0], t):
+            inside = np.clip(t, self._times[0], self._times[-1])
+            self._asked = asked = t, self._places(inside), self._turns(inside)
+        return asked[1:]
 
 
 def aligned_robustly(points: F64, places: F64) -> tuple[float, F64, F64]:
