@@ -226,6 +226,7 @@ class ParameterPanel:
         self._ground = gui.add_html("")
         self._share_before = float("nan")  # percent of ground in the scan shown before the sliders moved
         self._ground_changes = Changes(page.now, PANEL_PERIOD_S)
+        self._controls_due, self._resets_due = Changes(page.now), Changes(page.now)
         # Below the sliders and always there, so that nothing moves under the mouse.
         self._undo = add_button(gui, "Undo", lambda _: self._step(-1), viser.Icon.ARROW_BACK_UP, disabled=True)
         self._redo = add_button(gui, "Redo", lambda _: self._step(1), viser.Icon.ARROW_FORWARD_UP, disabled=True)
@@ -254,9 +255,10 @@ class ParameterPanel:
             elif edit.sent and now - edit.at >= _HOLD_S and snapshot.progress is None:
                 self._edits.pop(path, None)
         self._params = snapshot.params
-        for path in self._widgets.keys() - self._edits.keys():
-            for widget in self._widgets[path]:
-                widget.show(snapshot.params.value(path))
+        if self._controls_due(snapshot.params, " ".join(self._edits)):
+            for path in self._widgets.keys() - self._edits.keys():
+                for widget in self._widgets[path]:
+                    widget.show(snapshot.params.value(path))
         self._history.see(snapshot.params, now)
         edits = list(self._edits.items())
         if self._released and all(snapshot.params.value(path) == edit.value for path, edit in edits):
@@ -268,7 +270,8 @@ class ParameterPanel:
             button.label = f"{verb} {', '.join(self._names[name] for name in list(names)[:2])}".strip()
         if (recording := snapshot.recording.path if snapshot.recording else None) != self._recording:
             self._recording, self._opened = recording, snapshot.params
-        self._show_resets(snapshot.params)
+        if self._resets_due(snapshot.params, self._opened):
+            self._show_resets(snapshot.params)
         self._show_ground(snapshot, tuning)
         self._pending.visible = self._restart.visible = bool(snapshot.pending_restart)
         self._pending.content = panel("pending", snapshot.pending_restart)
