@@ -46,15 +46,15 @@ class Site:
         return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
 
     def restart(self, after_s: float) -> None:
-        """As an orchestrator does: the workers go with their scheduler and come back with it, a while later."""
+        """As an orchestrator does: the workers go with their scheduler and one comes back with it, a while later."""
         for process in (self.scheduler, *self.workers):
             process.kill()
             process.wait()
-        threading.Timer(after_s, self.begin).start()
+        threading.Timer(after_s, self.begin, (1,)).start()
 
-    def begin(self) -> None:
+    def begin(self, workers: int = 2) -> None:
         self.scheduler = self.start("scheduler", "--port", str(self.port), "--no-dashboard")
-        self.workers = [self.worker() for _ in range(2)]
+        self.workers = [self.worker() for _ in range(workers)]
 
     def stop(self) -> None:
         for process in (*self.workers, self.scheduler):

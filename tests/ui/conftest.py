@@ -4,16 +4,15 @@ import asyncio
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 import viser
-import viser._icons
 from viser._messages import GuiUpdateMessage
 
 from app.server.protocol import Command, Snapshot, StepFrame
+from app.server.viser_adapter import _list_icons_once
 from app.ui.widgets import Page
 from tests.ui.fake_engine import FakeEngine
 
@@ -85,10 +84,10 @@ def clouds(server: viser.ViserServer) -> dict[str, Cloud]:
 
 @pytest.fixture(scope="session", autouse=True)
 def icons_read_once() -> Iterator[None]:
-    """viser keeps 32 of them. A workbench has more, so each would read them from their archive, for half a second."""
+    """As for the workbench's own viser: else each icon costs a list of all, and each worker a second."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("viser._gui_api", "viser._gui_handles"):
-            patch.setattr(f"{module}.svg_from_icon", cache(viser._icons.svg_from_icon))
+        patch.setattr("viser._icons.zipfile", None)
+        _list_icons_once()
         yield
 
 
