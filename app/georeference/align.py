@@ -16,7 +16,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from scipy import optimize
 
 from app.georeference.drift import constants_despite_drift, drift_deviations
 from app.georeference.fixes import Fixes
@@ -46,9 +45,6 @@ FEWEST = 8
 COARSE_FIXES = 200
 MOST_STEPS = 50
 """Of one fit. Sound fixes take up to 30; those that do not follow the trajectory would take hundreds."""
-
-_least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
-_fit = partial(_least_squares, x_scale="jac", max_nfev=MOST_STEPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,6 +332,14 @@ def _deviations(J: F64) -> F64:
     values, vectors = np.linalg.eigh((J / lengths).T @ (J / lengths))
     values = np.where(values > 1e-12, values, 1e-300)
     return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)) / lengths)
+
+
+def _fit(errors: Any, start: F64, **loss: Any) -> Any:
+    """SciPy's result. errors: of the unknowns (k,), whitened (n,)."""
+    from scipy import optimize  # every process imports this module, and few align
+
+    least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
+    return least_squares(errors, start, x_scale="jac", max_nfev=MOST_STEPS, **loss)
 
 
 def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import optimize
 
 from app.georeference.align import FEWEST, MEDIAN_SIGMAS, MOST_SIGMAS, Alignment, overrides_of
 from app.georeference.fixes import Fixes
@@ -35,8 +34,6 @@ STRETCH_S = 3.0
 """Fixes of every other stretch predict those between them."""
 STEP_S, EXACT_S, FARTHEST_S = 2e-3, 1e-5, 2.0
 """Of the search for the clocks' offset: its first step, its end, and how far from that of the alignment it may end."""
-
-_root: Any = optimize.root_scalar
 
 
 def bend(
@@ -149,7 +146,10 @@ class _Problem:
         The map bends for each offset that is tried. So drift, which looks like an offset to an alignment, does not
         when it is in the graph.
         """
+        from scipy import optimize  # the page's engine imports this module, and few maps are bent
+
         slopes: list[float] = []
+        find_root: Any = optimize.root_scalar
 
         def slope(late: float) -> float:
             """Of half the sum of squares at its optimum over all poses: poses need not be differentiated."""
@@ -161,7 +161,7 @@ class _Problem:
             slopes.append(float(pull[which].sum()))
             return slopes[-1]
 
-        end = _root(slope, x0=offset_s, x1=offset_s + STEP_S, method="secant", xtol=EXACT_S, maxiter=20)
+        end = find_root(slope, x0=offset_s, x1=offset_s + STEP_S, method="secant", xtol=EXACT_S, maxiter=20)
         bend = (slopes[1] - slopes[0]) / STEP_S
         if not end.converged or abs(end.root - self.found.offset_s) > FARTHEST_S or bend <= 0:
             return offset_s, float("nan")

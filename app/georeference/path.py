@@ -1,7 +1,6 @@
 """The path of the IMU, and of an antenna on it, at any time between the poses of a trajectory; where it fits places."""
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from app.slam import lie
@@ -18,6 +17,8 @@ class PathOverTime:
     """Where the IMU was between the poses of a trajectory (4 or more); times in s since the first pose."""
 
     def __init__(self, trajectory: Trajectory) -> None:
+        from scipy.interpolate import make_interp_spline  # every process imports this module, and few need a path
+
         self.start_ns = int(trajectory.stamps_ns[0])
         self._times = (trajectory.stamps_ns - self.start_ns) * 1e-9
         self._places = make_interp_spline(self._times, trajectory.positions, k=3)

@@ -6,7 +6,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import viser
-from scipy import optimize
 
 from app.georeference.align import Alignment
 from app.georeference.control import control_table, require_sound
@@ -29,7 +28,6 @@ from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, limited, show
 
-_least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
 MOST_ROWS: Final = 100
 _NEAR_M, _FEWEST, _WORST_M = 0.03, 12, 0.01
 """Largest distance (m) of a point of a sphere from it; how many are needed; and their largest RMS distance (m)."""
@@ -101,6 +99,9 @@ def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: 
     Raises:
         HemislamError: what is there is no such sphere.
     """
+    from scipy import optimize  # the page imports this module, and few look for spheres
+
+    least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
     T = poses[spot.keyframe]
     at = lie.moved(T, spot.at)
     points = around(chunks, poses, at, 2.5 * radius)
@@ -110,10 +111,10 @@ def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: 
         return np.asarray(np.linalg.norm(points - centre, axis=1) - radius)
 
     if len(points) >= _FEWEST:
-        behind = _least_squares(off, behind, loss="cauchy", f_scale=_NEAR_M / 3).x
+        behind = least_squares(off, behind, loss="cauchy", f_scale=_NEAR_M / 3).x
         near = np.abs(off(behind)) < _NEAR_M
         if near.sum() >= _FEWEST:
-            behind = _least_squares(lambda centre: off(centre)[near], behind).x
+            behind = least_squares(lambda centre: off(centre)[near], behind).x
             if np.sqrt((off(behind)[near] ** 2).mean()) < _WORST_M and near.mean() > 0.5:
                 x, y, z = (T[:3, :3].T @ (behind - T[:3, 3])).tolist()
                 return x, y, z
