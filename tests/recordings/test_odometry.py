@@ -104,9 +104,9 @@ def test_the_command_line_writes_the_same_bytes_twice(shared_data: Path, tmp_pat
     for threads in ("1", "2"):
         out = tmp_path / threads
         command = [sys.executable, "-m", "app", "run", str(shared_data / "hall_bpearl.mcap"), "--out", str(out)]
-        command += ["--preset", "h2lid-mount", "--start", "3", "--duration", "2", "--set", "loops.enabled=false"]
+        command += ["--preset", "h2lid-mount", "--start", "3", "--duration", "3"]
         environment = os.environ | {"OPENBLAS_NUM_THREADS": threads, "PYTHONPATH": str(ROOT)}
         subprocess.run(command, env=environment, cwd=ROOT, check=True, capture_output=True, timeout=300)
         written.append((out / "trajectory.tum").read_bytes())
-    assert written[0].count(b"\n") >= 18
+    assert written[0].count(b"\n") >= 28
     assert written[0] == written[1]
