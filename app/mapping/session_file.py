@@ -283,14 +283,14 @@ def read_session(path: Path) -> SavedSession:
 def _state_of(entry: Mapping[str, Any]) -> tuple[State, str]:
     """The state in a line, and what was left out of it, as in `SavedSession`: what is only shown and cannot be."""
     entry, left_out = dict(entry), []
-    for name in _SHOWN.keys() & entry.keys():
-        what, adapter = _SHOWN[name]
+    for name, (what, adapter) in _SHOWN.items():
         try:
-            adapter.validate_python(entry[name])
+            if name in entry:
+                adapter.validate_python(entry[name])
         except (HemislamError, ValidationError) as error:
             del entry[name]
             left_out.append(f"The session's {what} were left out ({_why(error)}).")
-    return _STATE.validate_python(entry), " ".join(sorted(left_out))
+    return _STATE.validate_python(entry), " ".join(left_out)
 
 
 def _why(error: Exception) -> str:

@@ -29,10 +29,11 @@ class CaptureError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class _Interface:
-    """Type of network, time units in a second."""
+    """Type of network, time units in a second, ns to add."""
 
     link: int
     units: int
+    offset_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,7 @@ class Capture:
                 number, high, low, captured, _ = struct.unpack_from(order + "5I", body)
                 if number < len(interfaces):
                     interface = interfaces[number]
-                    time_ns = (high << 32 | low) * 1_000_000_000 // interface.units
+                    time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns
                     yield CapturePlace(position, order, interfaces), time_ns, interface.link, body[20 : 20 + captured]
 
 
@@ -138,7 +139,7 @@ def _taken(file: BufferedReader, size: int) -> bytes:
 
 def _interface(body: bytes, order: str) -> _Interface:
     link = int(struct.unpack_from(order + "H", body)[0])
-    units, at = 1_000_000, 8
+    units, offset_s, at = 1_000_000, 0, 8
     while at + 4 <= len(body) - 4:
         code, length = struct.unpack_from(order + "2H", body, at)
         value = body[at + 4 : at + 4 + length]
@@ -146,8 +147,10 @@ def _interface(body: bytes, order: str) -> _Interface:
             break
         if code == 9 and value:  # if_tsresol
             units = 2 ** (value[0] & 0x7F) if value[0] & 0x80 else 10 ** min(value[0], 18)
+        elif code == 14 and len(value) == 8:  # if_tsoffset
+            offset_s = int(struct.unpack(order + "q", value)[0])
         at += 4 + (length + 3) // 4 * 4
-    return _Interface(link, units)
+    return _Interface(link, units, offset_s * 1_000_000_000)
 
 
 def _ip_packet(link: int, frame: bytes) -> bytes:
