@@ -26,6 +26,8 @@ from app.slam.types import F64, I64, Cloud, Keyframe, Mask
 
 NEAR_M = 3.0
 """Added to the reach of drift: places this far apart still share a view."""
+FAR_M = 40.0
+"""Reach of submaps where little stands upright nearby, as on a plaza."""
 WIDER = 2.0
 """Odometry that slipped is farther off than the model of drift allows, so it is searched this many times as far."""
 KEPT_PREPARED = 8
@@ -65,9 +67,10 @@ class Detector:
     def __init__(self, params: LoopsParams) -> None:
         self.half = params.submap_keyframes
         self.ahead = self.half + slips.REACH - 1
-        self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS)
+        self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS, FAR_M)
         self._around = lru_cache(KEPT_SUBMAPS)(lambda *key: self._submaps.around(key[0], self._poses, *key[1:]))
         self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
+        self._wide = lru_cache(KEPT_PREPARED)(self._far_submap)
         self._pieces = lru_cache(KEPT_PIECES)(self._piece)
         self._slips: dict[tuple[int, int], Slip | None] = {}
         self._heads: list[Keyframe] = []
@@ -142,6 +145,7 @@ class Detector:
         self._submaps.truncate(len(self))
         self._around.cache_clear()
         self._prepared.cache_clear()
+        self._wide.cache_clear()
         self._pieces.cache_clear()
         self._slips.clear()
 
@@ -156,13 +160,13 @@ class Detector:
     def context(self, index: int) -> ScanContext:
         return self._contexts[index] if index < self.described else self.describe(index)
 
-    def submap(self, index: int) -> Prepared:
+    def submap(self, index: int, *, wide: bool = False) -> Prepared:
         """From the keyframes around one, up to the nearest slip of odometry on either side."""
         before = range(index, self._first(index, self.half), -1)
         after = range(index + 1, self.last(index, self.half) + 1)
         first = next((k for k in before if self.slip(k) is not None), before.stop)
         end = next((k for k in after if self.slip(k) is not None), after.stop) - 1
-        return self._prepared(index, first, end)
+        return (self._wide if wide else self._prepared)(index, first, end)
 
     def slip(self, index: int) -> Slip | None:
         """How odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`.
@@ -204,9 +208,13 @@ class Detector:
         return np.asarray(self.T_level_imu(older) @ T_older_newer @ lie.inverse(self.T_level_imu(newer)))
 
     def both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
-        """Their submaps; the newer one is made first, since it is needed again next."""
+        """Their submaps, which reach farther if one place is bare; the newer one is made first: it is needed again."""
         source = self.submap(newer)
-        return self.submap(older), source
+        target = self.submap(older)
+        if source.bare or target.bare:
+            source = self.submap(newer, wide=True)
+            target = self.submap(older, wide=True)
+        return target, source
 
     def detail(self, older: int, newer: int, poses: F64, T_older_newer: F64 | None) -> LoopDetail:
         """Both places, and how they fit at a loop's measurement; None: as the graph has them.
@@ -265,6 +273,9 @@ class Detector:
         """The first keyframe after the last pause before one, or of all."""
         paused = np.flatnonzero(self._resumed[: index + 1])
         return int(paused[-1]) if len(paused) else 0
+
+    def _far_submap(self, index: int, first: int, last: int) -> Prepared:
+        return verification.prepare(self._submaps.around(index, self._poses, first, last, far=True))
 
     def _piece(self, first: int, last: int) -> Prepared:
         return verification.prepare(self._submaps.around(first, self._poses, first, last))

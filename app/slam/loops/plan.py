@@ -15,8 +15,9 @@ from app.slam.kernels import submaps
 from app.slam.loops.verification import Prepared
 from app.slam.types import F64, I64
 
-CELL_M, CELLS = 0.4, 128
-"""Of a plan. It wraps around; submaps reach 20 m, so shifts of up to `FARTHEST_M` can be distinguished."""
+CELL_M = 0.4
+EDGE = 2.56
+"""Of a plan, times the reach of its submap. It wraps around, so shifts of up to `FARTHEST_M` can be distinguished."""
 FARTHEST_M = 11.0
 TURN = np.radians(3.0)
 """Step of the turns that are tried; at the rim of a submap it moves a point by a metre."""
@@ -48,43 +49,44 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     yaws = np.arctan2(T_guess[1, 0], T_guess[0, 0]) + np.arange(-steps, steps + 1) * TURN
     reach = int(np.ceil(min(window.reach_m, FARTHEST_M) / CELL_M))
     shifts = np.arange(-reach, reach + 1)
-    spectrum = np.fft.rfft2(_plan(target, 0.0, np.zeros(3)))
+    cells = round(EDGE * max(target.submap.reach, source.submap.reach) / CELL_M)
+    spectrum = np.fft.rfft2(_plan(target, 0.0, np.zeros(3), cells))
     alike = np.empty((len(yaws), len(shifts), len(shifts)))
     for index, yaw in enumerate(yaws):
-        turned = np.fft.rfft2(_plan(source, yaw, T_guess[:3, 3]))
-        alike[index] = np.fft.irfft2(spectrum * turned.conj(), (CELLS, CELLS))[np.ix_(shifts, shifts)]
+        turned = np.fft.rfft2(_plan(source, yaw, T_guess[:3, 3], cells))
+        alike[index] = np.fft.irfft2(spectrum * turned.conj(), (cells, cells))[np.ix_(shifts, shifts)]
     alike[:, np.hypot(shifts[:, None], shifts) > reach] = 0.0
     highest = ndimage.maximum_filter(alike, SAME, mode="constant")  # type: ignore[attr-defined]  # no types
     found = np.argwhere((alike >= highest) & (alike > LEAST * alike.max()))
     best = found[np.argsort(-alike[tuple(found.T)], kind="stable")[:PEAKS]]
     return [
-        _on_ground(target, source, _upright(yaws[k], T_guess[:3, 3] + CELL_M * np.array([i - reach, j - reach, 0.0])))
-        for k, i, j in best
+        _on_ground(target, source, _upright(yaws[k], T_guess[:3, 3] + shift), cells)
+        for k, shift in ((k, CELL_M * np.array([i - reach, j - reach, 0.0])) for k, i, j in best)
     ]
 
 
-def _plan(prepared: Prepared, yaw: float, position: F64) -> F64:
-    """(CELLS, CELLS) of a submap turned about the vertical and moved; the origin is in the first cell."""
-    plan = np.empty((CELLS, CELLS))
+def _plan(prepared: Prepared, yaw: float, position: F64, cells: int) -> F64:
+    """(cells, cells) of a submap turned about the vertical and moved; the origin is in the first cell."""
+    plan = np.empty((cells, cells))
     submaps.columns(prepared.points, prepared.level, prepared.upright, yaw, position, CELL_M, BARE, TALLEST, plan)
     return plan
 
 
-def _on_ground(target: Prepared, source: Prepared, T: F64) -> F64:
+def _on_ground(target: Prepared, source: Prepared, T: F64, cells: int) -> F64:
     """The same, raised or lowered until the source's ground lies on the target's."""
     below, above = target.points[target.level], lie.moved(T, source.points[source.level])
-    there, here = _cells(below), _cells(above)
-    count = np.bincount(there, minlength=CELLS * CELLS)
-    height = np.bincount(there, below[:, 2], CELLS * CELLS)
+    there, here = _cells(below, cells), _cells(above, cells)
+    count = np.bincount(there, minlength=cells * cells)
+    height = np.bincount(there, below[:, 2], cells * cells)
     both = count[here] > 0
     if both.any():
         T[2, 3] -= np.median(above[both, 2] - height[here[both]] / count[here[both]])
     return T
 
 
-def _cells(points: F64) -> I64:
-    index = np.floor(points[:, :2] / CELL_M).astype(np.int64) % CELLS
-    return np.asarray(index[:, 0] * CELLS + index[:, 1])
+def _cells(points: F64, cells: int) -> I64:
+    index = np.floor(points[:, :2] / CELL_M).astype(np.int64) % cells
+    return np.asarray(index[:, 0] * cells + index[:, 1])
 
 
 def _upright(yaw: float, position: F64) -> F64:

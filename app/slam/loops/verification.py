@@ -35,8 +35,10 @@ FITS_M = 0.15
 """A point this near to the plane of its partner fits, roughly."""
 PARTNER_M = 0.3
 """A point with another within this distance in the other submap has a partner."""
-COMMON_M = 15.0
-"""Overlap is judged on points this near to both keyframes: there both submaps are dense."""
+COMMON = 0.75
+"""Overlap is judged on points this near to both keyframes, of the reach: there both submaps are dense."""
+BARE = 0.05
+"""A place is bare if less than this share of its flat points is upright: then hardly anything holds it in plan."""
 LEAST_UPRIGHT = 50
 """With fewer upright points than this near both keyframes, overlap is not evidence."""
 DISTURBANCE_M = 0.4
@@ -64,6 +66,10 @@ class Prepared:
     chosen: I64
     few: I64
     judged: I64
+
+    @property
+    def bare(self) -> bool:
+        return bool(int(np.count_nonzero(self.flat & self.upright)) < BARE * np.count_nonzero(self.flat))
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +167,7 @@ def assess(target: Prepared, source: Prepared, T: F64) -> Fit:
     """Overlap, residuals and information of a source placed on a target at T (4, 4)."""
     back = lie.inverse(T)
     overlap = min(_overlap(target, source, T), _overlap(source, target, back))
-    near = np.flatnonzero(_near(source.points @ T[:3, :3].T + T[:3, 3], T[:3, 3]) & source.flat)
+    near = np.flatnonzero(_near(target, source, source.points @ T[:3, :3].T + T[:3, 3], T[:3, 3]) & source.flat)
     information, _, residuals = _pull(target, source.points[near], source.normals[near], T, PARTNER_M, np.inf)
     return Fit(T, overlap, residuals[~np.isnan(residuals)], information)
 
@@ -201,15 +207,16 @@ def _pull(target: Prepared, points: F64, normals: F64, T: F64, reach: float, sca
 
 def _overlap(target: Prepared, source: Prepared, T: F64) -> float:
     moved = source.points[source.judged] @ T[:3, :3].T + T[:3, 3]
-    near = moved[_near(moved, T[:3, 3])]
+    near = moved[_near(target, source, moved, T[:3, 3])]
     return float((_nearest(target, near)[1] < PARTNER_M**2).mean()) if len(near) >= LEAST_UPRIGHT else 0.0
 
 
-def _near(points: F64, origin: F64) -> Mask:
+def _near(target: Prepared, source: Prepared, points: F64, origin: F64) -> Mask:
     """Which points (n, 3), target frame, lie near both the target's origin and `origin`."""
     to_target = np.einsum("ni,ni->n", points, points)
     to_source = np.einsum("ni,ni->n", points - origin, points - origin)
-    return np.asarray(np.maximum(to_target, to_source) < COMMON_M**2)
+    reach = COMMON * min(target.submap.reach, source.submap.reach)
+    return np.asarray(np.maximum(to_target, to_source) < reach**2)
 
 
 def _nearest(target: Prepared, points: F64) -> tuple[I64, F64]:
