@@ -59,9 +59,10 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     highest = ndimage.maximum_filter(alike, SAME, mode="constant")  # type: ignore[attr-defined]  # no types
     found = np.argwhere((alike >= highest) & (alike > LEAST * alike.max()))
     best = found[np.argsort(-alike[tuple(found.T)], kind="stable")[:PEAKS]]
+    moves = CELL_M * np.column_stack([best[:, 1:] - reach, np.zeros(len(best))])
     return [
         _on_ground(target, source, _upright(yaws[k], T_guess[:3, 3] + shift), cells)
-        for k, shift in ((k, CELL_M * np.array([i - reach, j - reach, 0.0])) for k, i, j in best)
+        for k, shift in zip(best[:, 0], moves, strict=True)
     ]
 
 

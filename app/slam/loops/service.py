@@ -119,7 +119,7 @@ def warm_up() -> None:
     points = rng.uniform(0.0, 4.0, (len(sides), 3)).astype(np.float32)
     points[np.arange(len(sides)), sides] = 0.0  # a corner of three walls
     thin = VoxelGrid().downsample(points, 0.1).points
-    place = verification.prepare(Submap(0, thin, np.full_like(thin, 2.0)))
+    place = verification.prepare(Submap(0, thin, np.full_like(thin, 2.0), scan_context.RADIUS))
     none = Deviation(0.0, 0.0, 0.0)
     found = placing.place(place, place, np.eye(4), Window(1.0, 0.1), lambda T: none, most_sigmas=1.0, most_slide=0.1)
     verification.refine(place, place, found.fit.T_target_source)

@@ -29,7 +29,7 @@ class Submap:
     keyframe: int
     points: F32
     eyes: F32
-    reach: float = 20.0
+    reach: float
 
 
 class Submaps:
@@ -39,7 +39,7 @@ class Submaps:
         voxel_size: m, of the thinning. near, far: m around the keyframe that a submap may reach.
     """
 
-    def __init__(self, voxel_size: float, near: float, far: float = 40.0) -> None:
+    def __init__(self, voxel_size: float, near: float, far: float) -> None:
         self._voxel_size, self._near, self._far = voxel_size, near, far
         self._grid = VoxelGrid()
         self._file = tempfile.TemporaryFile(prefix="hemislam-loops-")  # noqa: SIM115 - closed by close()

@@ -38,7 +38,7 @@ PARTNER_M = 0.3
 COMMON = 0.75
 """Overlap is judged on points this near to both keyframes, of the reach: there both submaps are dense."""
 BARE = 0.05
-"""A place is bare if less than this share of its flat points is upright: then hardly anything holds it in plan."""
+"""A place is bare if less than this share of its flat points is upright."""
 LEAST_UPRIGHT = 50
 """With fewer upright points than this near both keyframes, overlap is not evidence."""
 DISTURBANCE_M = 0.4
@@ -69,7 +69,8 @@ class Prepared:
 
     @property
     def bare(self) -> bool:
-        return bool(int(np.count_nonzero(self.flat & self.upright)) < BARE * np.count_nonzero(self.flat))
+        """Whether hardly anything near holds the place in plan."""
+        return int(np.count_nonzero(self.flat & self.upright)) < BARE * int(np.count_nonzero(self.flat))
 
 
 @dataclass(frozen=True, slots=True)

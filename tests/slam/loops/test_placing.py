@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from app.slam import lie
+from app.slam.loops.detection import FAR_M, Detector
 from app.slam.loops.drift import Deviation
 from app.slam.loops.placing import Placement, place
 from app.slam.loops.plan import EVERYWHERE, Window, placements
 from app.slam.loops.verification import Prepared
-from app.slam.types import F64
+from app.slam.sections import LoopsParams
+from app.slam.types import F64, Cloud, Keyframe
 from tests.slam.loops.test_verification import FINS, corridor, pose, seen, wall
 
 EVEN = tuple(np.repeat(np.arange(-14.0, 14.0, 4.0), 2))
@@ -123,3 +125,45 @@ def test_places_that_share_nothing_do_not_fit_rather_than_fail() -> None:
     found = laid(target, source, pose(500.0, 0.0, 0.0, 0.0), Window(0.0, 0.0))
     assert found.fit.overlap == 0.0 and np.isnan(found.fit.residual_rms)
     assert found.alternative_m == np.inf
+
+
+def plaza(rng: np.random.Generator, houses: list[tuple[tuple[float, float], tuple[float, float]]]) -> F64:
+    """A level floor, and far from its middle the walls of houses."""
+    floor = np.column_stack([rng.uniform(-16, 16, (9_000, 2)), np.full(9_000, -1.2)])
+    points = np.vstack([floor, *(wall(*house, rng, 6.0) for house in houses)])
+    return np.asarray(points + rng.normal(scale=0.01, size=points.shape))
+
+
+def both(there: F64, here: F64, T_there_here: F64) -> tuple[Prepared, Prepared]:
+    """The submaps of two keyframes that saw these points, given where the first one was."""
+    detector = Detector(LoopsParams(submap_keyframes=0))
+    for index, points in enumerate((there, lie.moved(lie.inverse(T_there_here), here))):
+        n = len(points)
+        cloud = Cloud(points.astype(np.float32), np.zeros(n, np.uint8), np.zeros(n, np.float32), np.zeros(n, np.uint16),
+            np.zeros(n, np.int32))  # fmt: skip
+        detector.take(Keyframe(index, index, index, np.eye(4), np.eye(4), np.eye(6), cloud))
+        detector.go_on()
+    return detector.both(0, 1)
+
+
+def test_a_bare_plaza_is_held_by_the_houses_around_it() -> None:
+    houses = [((-20.0, 27.0), (5.0, 29.0)), ((7.0, 26.0), (22.0, 25.0)), ((26.0, -18.0), (28.0, 9.0)),
+        ((-27.0, -9.0), (-26.0, 16.0)), ((-14.0, -26.0), (12.0, -28.0)), ((-27.0, -9.0), (-31.0, -9.5))]  # fmt: skip
+    truth = pose(1.5, -1.0, 0.0, 25.0)
+    there, here = (plaza(np.random.default_rng(seed), houses) for seed in range(2))
+    target, source = both(there, here, truth)
+    found = laid(target, source, pose(3.5, -2.5, 0.3, 20.0), Window(4.0, 0.2))
+    assert np.linalg.norm(found.fit.T_target_source[:3, 3] - truth[:3, 3]) < 0.05
+    assert found.open is None
+    assert source.submap.reach == FAR_M
+
+
+def test_equal_houses_along_a_wide_avenue_leave_the_way_along_it_open_or_ambiguous() -> None:
+    """They are 6 m wide; a bay of 1 m lies between any two. The end of the avenue is out of sight."""
+    fronts = [((x, side * 27.0), (x + 5.0, side * 27.0)) for x in np.arange(-45.0, 45.0, 6.0) for side in (-1, 1)]
+    bays = [((x, side * 27.0), (x, side * 29.0)) for x in np.arange(-45.0, 45.0, 6.0) for side in (-1, 1)]
+    there, here = (plaza(np.random.default_rng(seed), fronts + bays) for seed in range(2))
+    target, source = both(there, here, pose(0.5, 0.0, 0.0, 0.0))
+    found = laid(target, source, pose(3.2, 0.0, 0.0, 0.0), Window(7.0, 0.1))
+    assert target.submap.reach == FAR_M
+    assert found.open is not None or found.alternative_m < 7.0

@@ -1,17 +1,18 @@
 """A submap is its keyframes' clouds, each thinned, shifted to where odometry has it, and thinned together."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.slam.loops.submap import Submap, Submaps
+from app.slam.loops.submap import Submaps
 from app.slam.types import F32, F64, Cloud, Keyframe
 from app.slam.voxel import VoxelGrid
 
-VOXEL, RADIUS = 0.25, 20.0
+VOXEL, RADIUS, FAR = 0.25, 20.0, 40.0
 
 
 def keyframe(index: int, points: F32, T_odom_imu: F64) -> Keyframe:
@@ -45,7 +46,7 @@ def one_by_one(clouds: list[F32], poses: F64, index: int) -> tuple[F32, F32]:
 
 @pytest.fixture
 def submaps() -> Iterator[Submaps]:
-    made = Submaps(VOXEL, RADIUS)
+    made = Submaps(VOXEL, RADIUS, FAR)
     yield made
     made.close()
 
@@ -53,7 +54,7 @@ def submaps() -> Iterator[Submaps]:
 @settings(deadline=None, max_examples=40)
 @given(sizes=st.lists(st.sampled_from([0, 0, 1, 40, 700]), min_size=1, max_size=8))
 def test_a_submap_is_that_of_its_clouds_one_by_one(sizes: list[int]) -> None:
-    made = Submaps(VOXEL, RADIUS)
+    made = Submaps(VOXEL, RADIUS, FAR)
     poses, clouds = walk(len(sizes)), [cloud_of(size, seed) for seed, size in enumerate(sizes)]
     for index, (cloud, T) in enumerate(zip(clouds, poses, strict=True)):
         made.append(keyframe(index, cloud, T))
@@ -69,7 +70,7 @@ def test_what_was_made_stays_as_it_is_when_others_are(submaps: Submaps) -> None:
     for index in range(6):
         submaps.append(keyframe(index, cloud_of(500, index), poses[index]))
     first = submaps.around(1, poses, 0, 2)
-    copy = Submap(1, first.points.copy(), first.eyes.copy())
+    copy = replace(first, points=first.points.copy(), eyes=first.eyes.copy())
     submaps.around(4, poses, 3, 5)
     assert np.array_equal(first.points, copy.points) and np.array_equal(first.eyes, copy.eyes)
 
@@ -86,3 +87,12 @@ def test_clouds_that_take_the_place_of_forgotten_ones_are_read_as_they_are(subma
     got = submaps.around(2, poses, 0, 3)
     points, eyes = one_by_one(clouds, poses, 2)
     assert np.array_equal(got.points, points) and np.array_equal(got.eyes, eyes)
+
+
+def test_what_is_far_is_in_far_submaps_only(submaps: Submaps) -> None:
+    near, far = np.float32([[5.0, 0.0, 0.0]]), np.float32([[0.0, 35.0, 0.0]])
+    submaps.append(keyframe(0, np.concatenate([near, far, np.float32([[50.0, 0.0, 0.0]])]), np.eye(4)))
+    assert np.array_equal(submaps.around(0, walk(1), 0, 0).points, near)
+    wide = submaps.around(0, walk(1), 0, 0, far=True)
+    assert {tuple(point) for point in wide.points} == {(5.0, 0.0, 0.0), (0.0, 35.0, 0.0)}
+    assert wide.reach == FAR

@@ -35,7 +35,7 @@ def seen(points: F64, T_here_there: F64) -> Prepared:
     """The same world, looked at from another level frame."""
     T = lie.inverse(T_here_there)
     moved = (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    return prepare(Submap(0, moved, np.zeros_like(moved)))
+    return prepare(Submap(0, moved, np.zeros_like(moved), 20.0))
 
 
 def pose(x: float, y: float, z: float, yaw_deg: float) -> F64:
@@ -75,8 +75,8 @@ def test_the_two_sides_of_a_wall_are_not_laid_on_each_other() -> None:
     rng = np.random.default_rng(0)
     left = wall((-6.0, 1.0), (6.0, 1.0), rng).astype(np.float32)
     right = wall((-6.0, 1.15), (6.0, 1.15), rng).astype(np.float32)
-    inside = prepare(Submap(0, left, np.zeros_like(left)))
-    outside = prepare(Submap(1, right, np.tile(np.float32([0.0, 3.0, 0.0]), (len(right), 1))))
+    inside = prepare(Submap(0, left, np.zeros_like(left), 20.0))
+    outside = prepare(Submap(1, right, np.tile(np.float32([0.0, 3.0, 0.0]), (len(right), 1)), 20.0))
     assert len(assess(inside, inside, np.eye(4)).residuals) > 100
     assert len(assess(inside, outside, np.eye(4)).residuals) == 0
 
