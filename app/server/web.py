@@ -2,15 +2,11 @@
 
 import asyncio
 import contextlib
-import errno
 import json
 import logging
 import math
-import os
 import signal
-import socket
 import ssl
-import sys
 import threading
 import webbrowser
 from collections import Counter
@@ -29,75 +25,15 @@ from tqdm import tqdm
 
 from app import __version__
 from app.server.access import MOST_OF_PICTURE, VIEWER, Access, Guard
+from app.server.address import has_display, links, listen
 from app.server.api import make_router
-from app.server.bridge import BUFFER_BYTES, bridge
+from app.server.bridge import bridge
 from app.server.folders import Folders
 from app.server.fork import Workspace
 from app.server.setup import Setup
 from app.server.viser_adapter import Viser, page_html, start_viser, viewer_html
 from app.server.worker import EngineProcess, RunningEngine
 from app.slam.errors import HemislamError
-
-UNREAD_S: Final = 120
-"""A connection whose peer takes no data for this long is closed by the system (Linux)."""
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A listening socket. Accepted connections inherit its options.
-
-    Raises:
-        HemislamError: the port is in use, or the address does not belong to this machine.
-    """
-    try:
-        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    except OSError:
-        raise HemislamError(f"{host} is not an address of this machine; choose another one by --host.") from None
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # named: else asyncio keeps Nagle on
-    if os.name == "posix":  # on Windows it would let two servers share the port
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_S * 1000)
-    try:
-        listener.bind(address)
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        if error.errno == errno.EADDRINUSE:
-            raise HemislamError(f"Port {port} is in use by another program; choose another one by --port.") from None
-        raise HemislamError(
-            f"The address {host}:{port} cannot be used ({error.strerror}); choose another one by --host and --port."
-        ) from None
-    return listener
-
-
-def links(host: str, access: Access, token: str | None = None) -> list[str]:
-    """The addresses to open: first for this computer, then for others.
-
-    Args:
-        token: to put into them; None: the owner's, if there is one.
-    """
-    names = ["localhost", _own_address()] if host in ("0.0.0.0", "::", "") else [host]
-    token = token or access.token
-    query = f"?token={token}" if token else ""
-    scheme = "https" if access.secure else "http"
-    return [f"{scheme}://{f'[{name}]' if ':' in name else name}:{access.port}/{query}" for name in names]
-
-
-def _own_address() -> str:
-    """This computer's address on the network that leads outside; its name if there is none."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing: it only chooses the route
-            return str(probe.getsockname()[0])
-        except OSError:
-            return socket.gethostname()
-
-
-def has_display() -> bool:
-    """Whether a browser can be opened here."""
-    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
 
 log = logging.getLogger(__name__)
 

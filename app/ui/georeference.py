@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import viser
@@ -11,117 +11,19 @@ from app.georeference.align import Alignment
 from app.georeference.control import control_table, require_sound
 from app.georeference.ledger import in_rows
 from app.georeference.survey import Pick, Survey
-from app.mapping.earth import FIX, POINT
 from app.mapping.kept import Spot
 from app.server.folders import Folders
-from app.server.protocol import Chunk, EditLoop, Georeference, RedoLoop, Snapshot, UndoLoop
-from app.slam import lie
+from app.server.protocol import EditLoop, Georeference, RedoLoop, Snapshot, UndoLoop
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
-from app.slam.types import F32, F64
 from app.ui.files import FileList
+from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit
 from app.ui.measure import MeasurePanel
-from app.ui.measure_maths import around
 from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, limited, show
-
-MOST_ROWS: Final = 100
-_NEAR_M, _FEWEST, _WORST_M = 0.03, 12, 0.01
-"""Largest distance (m) of a point of a sphere from it; how many are needed; and their largest RMS distance (m)."""
-
-
-class Row(NamedTuple):
-    """A fix or control point in the table. word: what a click on it sends. texts: residuals in m, distance in σ."""
-
-    name: str
-    word: str
-    used: bool
-    edited: bool
-    texts: tuple[str, ...]
-
-
-def rows_of(found: Alignment, current: Snapshot) -> list[Row]:
-    """Those that are left out or overridden first, then by their residuals."""
-    survey = current.earth.survey
-    kind = POINT if survey is not None and survey.control else FIX
-    edited = {edit.what for edit in current.loops.undo if isinstance(edit, Override)}
-    overridden = np.array([kind + name in edited for name in found.names])
-    length = np.linalg.norm(found.residuals, axis=1)
-    order = np.lexsort((-length, found.used & ~overridden))
-    return [
-        Row(
-            found.names[k],
-            f"override {kind}{found.names[k]}",
-            bool(found.used[k]),
-            bool(overridden[k]),
-            (*(f"{value:+.3f}" for value in found.residuals[k]), f"{found.distances[k]:.1f}"),
-        )
-        for k in order[:MOST_ROWS].tolist()
-    ]
-
-
-def lines_of(found: Alignment) -> tuple[F32, F32]:
-    """(n, 3) where fixes or points were measured, and (n, 2, 3) lines from there to where the map has them, m."""
-    measured = found.reference.from_crs(found.grid)
-    at = measured - found.residuals @ np.array(found.reference.rotation)
-    return measured.astype(np.float32), np.stack((measured, at), axis=1).astype(np.float32)
-
-
-def names_of(text: str) -> tuple[str, ...]:
-    """Of the control points in a table, each once: the page goes blank if a dropdown offers one twice.
-
-    Raises:
-        HemislamError: it has no heading, or a row is cut.
-    """
-    return tuple(dict.fromkeys(control_table(text).columns.get("name", ()))) if text.strip() else ()
-
-
-def numbers_in(text: str, what: str, count: int) -> list[float]:
-    """As many numbers as there must be, or none. Raises HemislamError, naming `what`."""
-    try:
-        found = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        found = [np.nan]
-    if len(found) not in (0, count) or not np.isfinite(found).all():
-        raise HemislamError(f"The {what} is {text}; it takes {count} number{'s' if count > 1 else ''}, or nothing.")
-    return found
-
-
-def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: float) -> tuple[float, float, float]:
-    """Of a sphere of known radius (m), by the points around a spot on it; m, in the IMU frame of the spot's keyframe.
-
-    Args:
-        poses: (k, 4, 4) T_map_imu of the chunks' keyframes.
-
-    Raises:
-        HemislamError: what is there is no such sphere.
-    """
-    from scipy import optimize  # the page imports this module, and few look for spheres
-
-    least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
-    T = poses[spot.keyframe]
-    at = lie.moved(T, spot.at)
-    points = around(chunks, poses, at, 2.5 * radius)
-    behind = at + radius * (at - T[:3, 3]) / np.linalg.norm(at - T[:3, 3])
-
-    def off(centre: F64) -> F64:
-        return np.asarray(np.linalg.norm(points - centre, axis=1) - radius)
-
-    if len(points) >= _FEWEST:
-        behind = least_squares(off, behind, loss="cauchy", f_scale=_NEAR_M / 3).x
-        near = np.abs(off(behind)) < _NEAR_M
-        if near.sum() >= _FEWEST:
-            behind = least_squares(lambda centre: off(centre)[near], behind).x
-            if np.sqrt((off(behind)[near] ** 2).mean()) < _WORST_M and near.mean() > 0.5:
-                x, y, z = (T[:3, :3].T @ (behind - T[:3, 3])).tolist()
-                return x, y, z
-    raise HemislamError(
-        f"The points there do not form a sphere of {radius:g} m radius; click its middle, or pick a point instead."
-    )
-
 
 NOTHING, RECORDED, FILE, CONTROL = "nothing", "fixes of the recording", "fixes of a file", "control points"
 _ALIGN, _FACTORS = "align only", "as factors"

@@ -13,8 +13,9 @@ from app.server.keeping import DropMeasure, KeepMeasure, RenameMeasure
 from app.server.protocol import Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import F64
+from app.ui.corners import snapped
 from app.ui.html import panel
-from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, snapped, words
+from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, words
 from app.ui.nodes import add_exact_points, add_lines, clear, segments
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, add_button, ask_text, by_user, show

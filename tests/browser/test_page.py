@@ -10,7 +10,7 @@ from app.export.box import Box
 from app.mapping.kept import Note
 from app.server.keeping import EditNote, KeepMeasure, SetClip
 from app.server.protocol import CompareWith, OpenRecording, Pause, Play, Seek, SetParams, SetSpeed, StepFrame
-from app.ui.clip import FACES, handle
+from app.ui.clip_maths import FACES, handle
 from tests.browser.conftest import ALPHA, SLIDERS, Bench, new_page
 
 

@@ -1,4 +1,4 @@
-"""A mapped room against its exact shape. Tests app/cli/compare.py, app/ui/measure_maths.py."""
+"""A mapped room against its exact shape. Tests app/cli/compare.py, app/ui/corners.py."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,8 @@ from app.export.map_file import MapFile
 from app.mapping.kept import Measure
 from app.server.chunks import thinned
 from app.slam.ply import header
-from app.ui.measure_maths import meet, meeting, numbers, places, snapped
+from app.ui.corners import meeting, snapped
+from app.ui.measure_maths import meet, numbers, places
 from tests.cli.conftest import ROOM
 
 Call = Callable[..., Any]

@@ -15,9 +15,10 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from app.server.access import Access
+from app.server.address import listen
 from app.server.folders import Folders
 from app.server.viser_adapter import Viser
-from app.server.web import Tls, listen, make_app, make_server
+from app.server.web import Tls, make_app, make_server
 from app.server.worker import EngineProcess
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")

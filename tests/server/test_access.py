@@ -13,7 +13,7 @@ from websockets.typing import Origin
 
 from app.logs import JsonLines
 from app.server.access import MOST_BYTES, Access
-from app.server.web import links
+from app.server.address import links
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from server_site import CAMERA, TIMEOUT_S, Site, packed, serving, until
 from websockets.exceptions import InvalidStatus
 
-from app.server import access, api, web
+from app.server import access, address, api, web
 from app.server.access import MOST_BYTES
 from app.server.viser_adapter import Viser
 from app.server.worker import EngineProcess
@@ -98,7 +98,7 @@ def served(port: int, peer: socket.socket) -> bool:
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="the system has no limit for unread data")
 def test_a_client_that_reads_nothing_is_disconnected(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "UNREAD_S", 1)
+    monkeypatch.setattr(address, "UNREAD_S", 1)
     with serving(site.engine, site.viser, site.folder, None) as strict, socket.socket() as peer:
         ask = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{strict.port}\r\n\r\n".encode()
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -1,6 +1,6 @@
 """The public port over real sockets: the page, tokens and origins, https, and how the server ends.
 
-Tests app/server/web.py.
+Tests app/server/address.py.
 """
 
 import asyncio
@@ -36,9 +36,10 @@ from app.sensors.live.feed import Pace, feed
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from app.server.access import Access
+from app.server.address import links, listen
 from app.server.setup import Setup
 from app.server.viser_adapter import Viser
-from app.server.web import Tls, links, listen
+from app.server.web import Tls
 from app.server.worker import EngineProcess
 from app.slam.errors import HemislamError
 

@@ -1,6 +1,6 @@
 """The clip box: its handles, its sections, and what of the map is shown.
 
-Tests app/ui/clip.py, app/ui/clip.py, app/ui/scene.py.
+Tests app/ui/clip.py, app/ui/clip_maths.py, app/ui/profile.py.
 """
 
 from dataclasses import replace
@@ -19,10 +19,11 @@ from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import NON_GROUND
 from app.ui.chunks import MapChunks
-from app.ui.clip import FACES, ClipPanel, along_line, carried, edges, handle, pulled
+from app.ui.clip import ClipPanel
+from app.ui.clip_maths import FACES, along_line, carried, edges, handle, pulled
 from app.ui.measure import MeasurePanel
 from app.ui.measure_maths import meet
-from app.ui.scene import ProfileNode, unrolled
+from app.ui.profile import ProfileNode, unrolled
 from app.ui.widgets import View
 from tests.ui.conftest import BusyThreads, Wire, browser_sends, clouds, page_of, user_sets
 

@@ -1,4 +1,4 @@
-"""What lays the map on Earth, chosen in the page. Tests app/ui/georeference.py, app/ui/georeference.py."""
+"""What lays the map on Earth, chosen in the page. Tests app/ui/georeference.py, app/ui/georeference_maths.py."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,18 +28,8 @@ from app.server.protocol import (
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Override
-from app.ui.georeference import (
-    CONTROL,
-    FILE,
-    NOTHING,
-    RECORDED,
-    GeoreferencePanel,
-    centre_of_sphere,
-    lines_of,
-    names_of,
-    numbers_in,
-    rows_of,
-)
+from app.ui.georeference import CONTROL, FILE, NOTHING, RECORDED, GeoreferencePanel
+from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
 from app.ui.measure import STOP, MeasurePanel
 from app.ui.measure_maths import as_csv, numbers, words
 from app.ui.widgets import View

@@ -1,4 +1,4 @@
-"""Pictures and flights. Tests app/ui/pictures.py, app/ui/pictures.py."""
+"""Pictures and flights. Tests app/ui/pictures.py, app/ui/picture_maths.py."""
 
 import io
 import itertools
@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from app.server.protocol import OpenedRecording, Snapshot
 from app.ui.camera import FOV
 from app.ui.colours import HEIGHT, LOOK, Key, Limits, key
-from app.ui.pictures import BACKGROUND, PicturesPanel, composed, flight, looking
+from app.ui.picture_maths import BACKGROUND, composed, flight, looking
+from app.ui.pictures import PicturesPanel
 from tests.ui.conftest import page_of
 
 CORNER = np.array([[0.0, 0.0, 1.5], [20.0, 0.0, 1.5], [20.0, 10.0, 1.5]])
