@@ -52,7 +52,7 @@ class PathOverTime:
         asked = self._asked
         if asked is None or not np.array_equal(asked[0], t):
             inside = np.clip(t, self._times[0], self._times[-1])
-            self._asked = asked = t, self._places(inside), self._turns(inside)
+            self._asked = asked = np.array(t), self._places(inside), self._turns(inside)
         return asked[1:]
 
 

@@ -1,7 +1,7 @@
 """Partial parameter trees for known devices, and the order in which settings override each other."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,16 +48,30 @@ metadata; the doctor shows that of a capture's unit. `hesai-xt`,
 a shaft)."""
 
 
+class _Appearance(NamedTuple):
+    """What the clouds of a scanner with an IMU of its own look like; all go all around.
+
+    Attributes:
+        preset: of the scanner. kinds: types of message. fields: that they have among others.
+        lines: numbers of scan lines; (): any. lowest, highest: deg, bounds of the lowest and of the highest elevation.
+    """
+
+    preset: str
+    kinds: tuple[str, ...]
+    fields: set[str]
+    lines: tuple[int, ...]
+    lowest: tuple[int, int]
+    highest: tuple[int, int]
+
+
 _POINTS = (POINT_CLOUD_2.name,)
-_APPEARANCES: tuple[tuple[str, tuple[str, ...], set[str], tuple[int, ...], tuple[int, int], tuple[int, int]], ...] = (
-    ("mid360", CUSTOM_MSGS, set(), (), (-9, 90), (40, 56)),
-    ("mid360", _POINTS, {"tag", "line"}, (), (-9, 90), (40, 56)),
-    ("airy", _POINTS, {"ring", "timestamp"}, (96,), (-3, 20), (60, 91)),
-    ("jt128", _POINTS, {"ring", "timestamp"}, (128,), (-8, 20), (60, 91)),
-    ("ouster", _POINTS, {"ring", "t", "reflectivity"}, (32, 64, 128), (-90, 0), (0, 91)),
+_APPEARANCES = (
+    _Appearance("mid360", CUSTOM_MSGS, set(), (), (-9, 90), (40, 56)),
+    _Appearance("mid360", _POINTS, {"tag", "line"}, (), (-9, 90), (40, 56)),
+    _Appearance("airy", _POINTS, {"ring", "timestamp"}, (96,), (-3, 20), (60, 91)),
+    _Appearance("jt128", _POINTS, {"ring", "timestamp"}, (128,), (-8, 20), (60, 91)),
+    _Appearance("ouster", _POINTS, {"ring", "t", "reflectivity"}, (32, 64, 128), (-90, 0), (0, 91)),
 )
-"""What the clouds of scanners with an IMU of their own look like: preset; types of message; fields that they have among
-others; numbers of scan lines, () for any; bounds of the lowest and of the highest elevation, deg. All go all around."""
 
 
 def preset_for(kind: str, probe: Probe) -> str:
@@ -65,16 +79,16 @@ def preset_for(kind: str, probe: Probe) -> str:
     points = probe.points
     lowest, highest = np.percentile(np.degrees(elevation(points)), [0.5, 99.5])
     around = np.histogram(np.arctan2(points[:, 1], points[:, 0]), 12, (-np.pi, np.pi))[0]
-    for name, kinds, fields, lines, (low_from, low_to), (high_from, high_to) in _APPEARANCES:
+    for one in _APPEARANCES:
         if (
-            kind in kinds
-            and fields <= probe.cloud.fields.keys()
-            and (not lines or int(probe.column("ring").max()) + 1 in lines)
-            and low_from < lowest < low_to
-            and high_from < highest < high_to
+            kind in one.kinds
+            and one.fields <= probe.cloud.fields.keys()
+            and (not one.lines or int(probe.column("ring").max()) + 1 in one.lines)
+            and one.lowest[0] < lowest < one.lowest[1]
+            and one.highest[0] < highest < one.highest[1]
             and np.count_nonzero(around) > 8
         ):
-            return name
+            return one.preset
     return ""
 
 
