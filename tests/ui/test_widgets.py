@@ -5,6 +5,7 @@ Tests app/ui/widgets.py.
 
 import ast
 import asyncio
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -83,7 +84,8 @@ def test_what_the_system_refuses_is_shown_as_a_sentence(server: viser.ViserServe
         Path("n" * 300).exists()
 
     event: Any = SimpleNamespace(client=client, target=SimpleNamespace(value=1))
-    asyncio.run(by_user(act)(event))
+    with ThreadPoolExecutor(1) as thread:  # in that of a test of a browser a loop runs already
+        thread.submit(asyncio.run, by_user(act)(event)).result()
     assert len(told) == 1 and told[0].startswith("The system refused: File name too long (nnn")
 
 
