@@ -9,9 +9,8 @@ a degree. The map's shape does not change.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -230,7 +229,7 @@ class _Problem:
         x, used = self._robust(start)
         R, shift, offset, arm = self._model(x)
         errors = self._errors(x)
-        J = _jacobian(partial(self._whitened, used=used), x)
+        J = self._jacobian(x, used)
         spread = max(1.0, float((errors[used] ** 2).sum()) / max(3 * int(used.sum()) - len(x), 1))
         sigmas = _deviations(J) * spread**0.5
         return _Solved(
@@ -261,7 +260,7 @@ class _Problem:
     def with_drift(self, solved: _Solved) -> _Solved:
         """The same, with standard deviations that count drift, and constants of the receiver that it hardly pulls."""
         used, x, residuals = solved.used, solved.x, solved.residuals[solved.used]
-        J = _jacobian(partial(self._whitened, used=used), x)
+        J = self._jacobian(x, used)
         sigmas, seconds = self.sigmas[used], self.seconds[used]
         influence = np.linalg.pinv(J).T[:-2].reshape(*residuals.shape, -1) / sigmas[..., None]
         drift = drift_deviations(residuals, influence, seconds)
@@ -304,6 +303,12 @@ class _Problem:
         """(3 k + 2,) errors of the k fixes that are used, and the tilt among the unknowns, in standard deviations."""
         return np.concatenate((self._errors(x)[used].ravel(), x[4:6] / LEVEL))
 
+    def _jacobian(self, x: F64, used: Mask) -> F64:
+        """(3 k + 2, unknowns) derivatives of these errors."""
+        steps = 1e-5 * np.eye(len(x))
+        columns = [self._whitened(x + step, used) - self._whitened(x - step, used) for step in steps]
+        return np.stack(columns, axis=1) / 2e-5
+
     def _fit_robustly(self, start: F64) -> Any:
         """SciPy's result, by all fixes but those that the user leaves out."""
         return _fit(self._whitened, start, loss="cauchy", f_scale=2.0, args=(self.overrides != 0,))
@@ -340,12 +345,6 @@ def _fit(errors: Any, start: F64, **loss: Any) -> Any:
 
     least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
     return least_squares(errors, start, x_scale="jac", max_nfev=MOST_STEPS, **loss)
-
-
-def _jacobian(function: Callable[[F64], F64], x: F64) -> F64:
-    step = 1e-5
-    columns = [(function(x + step * axis) - function(x - step * axis)) / (2 * step) for axis in np.eye(len(x))]
-    return np.stack(columns, axis=1)
 
 
 def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search: bool = True) -> tuple[float, float]:
