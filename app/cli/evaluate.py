@@ -11,7 +11,6 @@ import typer
 from app.cli.options import MOST_S, Duration, Imperfect, ParamsFor, Short, Suite, make_suite, with_params
 from app.slam.errors import HemislamError
 from app.slam.provenance import cores
-from app.slam.text_files import make_folder
 
 if TYPE_CHECKING:
     from app.evaluation.evaluate import Subject
@@ -137,7 +136,6 @@ def evaluate(
         [parse_variant(text) for text in variants or []], ablation=ablation, baselines=baselines or []
     )
     paths = list(recordings or [])
-    make_folder(out)
     if suite is not None:
         paths += make_suite(
             suite, out / "recordings", seeds or [0], short=short, imperfections=IMPERFECT if imperfect else NONE

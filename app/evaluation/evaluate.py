@@ -17,6 +17,7 @@ from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.provenance import sha256_of
+from app.slam.text_files import make_folder
 from app.slam.trajectory import Trajectory
 from app.slam.types import F64
 
@@ -71,7 +72,7 @@ def evaluate(
         The findings, and why runs failed, by (recording, variant).
 
     Raises:
-        HemislamError: a recording, truth or parameter cannot be used. This is checked before anything runs.
+        HemislamError: a recording, truth, parameter or the folder cannot be used. This is checked before anything runs.
     """
     jobs: dict[tuple[str, str], Job] = {}
     hashes: dict[str, str] = {}
@@ -90,6 +91,7 @@ def evaluate(
                 baseline=variant.baseline,
                 marks=subject.marks,
             )
+    make_folder(folder)
     failures = run(list(jobs.values()), folder / "runs")
     evaluated = []
     for subject in subjects:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import FiniteFloat
+
 from app.slam.arrays import Vector
 
 
@@ -33,5 +35,5 @@ class Survey:
     crs: str = ""
     height: str = ""
     lever: Vector | None = None
-    offset_s: float | None = None
+    offset_s: FiniteFloat | None = None
     factors: bool = False

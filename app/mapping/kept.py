@@ -3,10 +3,11 @@
 from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
-from pydantic import Field, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 from app.export.box import Box
 from app.mapping.painted import Stroke, entry_of, stroke_of
+from app.slam.arrays import Vector
 from app.slam.errors import HemislamError
 
 
@@ -18,9 +19,7 @@ class Note:
     text: str
 
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-FiniteVector = tuple[Finite, Finite, Finite]
-KeptView = tuple[FiniteVector, FiniteVector]
+KeptView = tuple[Vector, Vector]
 """Where a camera stands and what it looks at, (x, y, z) each, m, in the map."""
 
 
@@ -29,7 +28,7 @@ class Spot:
     """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
 
     keyframe: int
-    at: FiniteVector
+    at: Vector
 
 
 @dataclass(frozen=True, slots=True)

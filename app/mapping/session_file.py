@@ -25,6 +25,7 @@ from typing import IO, Annotated, Any
 from pydantic import (
     BeforeValidator,
     Field,
+    FiniteFloat,
     PlainSerializer,
     PlainValidator,
     TypeAdapter,
@@ -35,7 +36,7 @@ from pydantic import (
 from app import __version__
 from app.georeference.survey import Survey
 from app.mapping.breakpoints import Breakpoints
-from app.mapping.kept import Clip, Finite, Kept, KeptView, Measure
+from app.mapping.kept import Clip, Kept, KeptView, Measure
 from app.mapping.labels import LabelEdit
 from app.mapping.painted import marks, read_json
 from app.slam.errors import HemislamError
@@ -64,8 +65,8 @@ class Opened:
     """
 
     recording: Path
-    start_s: Finite = 0.0
-    duration_s: Finite | None = None
+    start_s: FiniteFloat = 0.0
+    duration_s: FiniteFloat | None = None
     nbytes: int = 0
 
 

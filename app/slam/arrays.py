@@ -2,6 +2,7 @@
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import FiniteFloat
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -10,4 +11,5 @@ I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 Mask = npt.NDArray[np.bool_]
-Vector = tuple[float, float, float]
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+"""Where pydantic reads one, it refuses nan and infinity."""

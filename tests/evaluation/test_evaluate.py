@@ -212,7 +212,8 @@ def test_two_variants_of_one_name_and_misspelt_parameters_are_refused() -> None:
 def test_what_cannot_be_done_is_said_in_one_sentence(
     recording: Path, tmp_path: Path, arguments: list[str], says: str
 ) -> None:
-    done = call(*(str(recording) if text == "RECORDING" else text for text in arguments), "--out", tmp_path)
-    assert done.exit_code == 2
+    out = tmp_path / "out"
+    done = call(*(str(recording) if text == "RECORDING" else text for text in arguments), "--out", out)
+    assert done.exit_code == 2 and not out.exists()
     assert says in done.stderr and "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

@@ -134,9 +134,14 @@ def test_places_that_are_nowhere_are_left_out_with_a_sentence(
 
 
 NOTES = [{"notes": [["x", "late"]]}, {"notes": [[1, None]]}]
+SURVEYS: list[dict[str, Any]] = [
+    {"survey": {"lever": [0, math.nan, 0]}},
+    {"survey": {"offset_s": math.inf}},
+    {"survey": {"picks": [{"name": "A", "keyframe": 0, "at": [0, 0, math.nan]}]}},
+]
 
 
-@pytest.mark.parametrize("wrong", [{"start_s": math.nan}, {"duration_s": math.inf}, *NOTES])
+@pytest.mark.parametrize("wrong", [{"start_s": math.nan}, {"duration_s": math.inf}, *NOTES, *SURVEYS])
 def test_numbers_and_words_that_cannot_be_are_damage(
     saved: SavedSession, tmp_path: Path, wrong: dict[str, Any]
 ) -> None:
