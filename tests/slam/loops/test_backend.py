@@ -82,6 +82,7 @@ def test_corridors_and_rooms_that_repeat_make_no_false_loop() -> None:
     assert len(errors) > 20, "true revisits are found all the same"
     assert errors[:, 0].max() < 0.5, "the next door is 4 m away, the next corridor 6 m"
     assert errors[:, 1].max() < 2.0
+    assert any("it is ambiguous" in edge.reason for edge in backend.edges), "where odometry allows both, neither counts"
 
 
 def test_flats_that_look_alike_stay_beside_one_another_even_if_odometry_drifts_more_than_it_may() -> None:
