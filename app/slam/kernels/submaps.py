@@ -14,7 +14,7 @@ def columns(points, level, upright, yaw, position, cell, bare, tallest, plan):
     """Raster of what stands upright, of points turned by yaw (rad) about the vertical and then moved.
 
     points (n, 3) f64 m; level, upright (n,) bool: ground, and neither ground nor ceiling; position (3,) m; cell: edge
-    of cells and layers, m. Out: plan (k, k) f64, which wraps around; the origin is in the first cell. Where something
+    of cells and layers, m. Out: plan (k, k) f32, which wraps around; the origin is in the first cell. Where something
     stands sqrt(layers / 2), counting at most `tallest` occupied layers; `bare` where there is only ground; else 0.
     """
     size = len(plan)

@@ -8,12 +8,12 @@ turn; heights follow from the ground. Registration begins at the best few.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+from scipy import fft, ndimage
 
 from app.slam import lie
 from app.slam.kernels import submaps
 from app.slam.loops.verification import Prepared
-from app.slam.types import F64, I64
+from app.slam.types import F32, F64, I64
 
 CELL_M = 0.4
 EDGE = 2.56
@@ -50,11 +50,11 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     reach = int(np.ceil(min(window.reach_m, FARTHEST_M) / CELL_M))
     shifts = np.arange(-reach, reach + 1)
     cells = round(EDGE * max(target.submap.reach, source.submap.reach) / CELL_M)
-    spectrum = np.fft.rfft2(_plan(target, 0.0, np.zeros(3), cells))
-    alike = np.empty((len(yaws), len(shifts), len(shifts)))
+    spectrum = fft.rfft2(_plan(target, 0.0, np.zeros(3), cells))
+    alike = np.empty((len(yaws), len(shifts), len(shifts)), np.float32)
     for index, yaw in enumerate(yaws):
-        turned = np.fft.rfft2(_plan(source, yaw, T_guess[:3, 3], cells))
-        alike[index] = np.fft.irfft2(spectrum * turned.conj(), (cells, cells))[np.ix_(shifts, shifts)]
+        turned = fft.rfft2(_plan(source, yaw, T_guess[:3, 3], cells))
+        alike[index] = fft.irfft2(spectrum * turned.conj(), (cells, cells))[np.ix_(shifts, shifts)]
     alike[:, np.hypot(shifts[:, None], shifts) > reach] = 0.0
     highest = ndimage.maximum_filter(alike, SAME, mode="constant")  # type: ignore[attr-defined]  # no types
     found = np.argwhere((alike >= highest) & (alike > LEAST * alike.max()))
@@ -66,9 +66,9 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     ]
 
 
-def _plan(prepared: Prepared, yaw: float, position: F64, cells: int) -> F64:
+def _plan(prepared: Prepared, yaw: float, position: F64, cells: int) -> F32:
     """(cells, cells) of a submap turned about the vertical and moved; the origin is in the first cell."""
-    plan = np.empty((cells, cells))
+    plan = np.empty((cells, cells), np.float32)
     submaps.columns(prepared.points, prepared.level, prepared.upright, yaw, position, CELL_M, BARE, TALLEST, plan)
     return plan
 
