@@ -49,10 +49,11 @@ class ClipPanel:
     ) -> None:
         gui = page.gui
         self._page, self._measure, self._camera, self._around = page, measure, camera, around
-        self._changes, self._scene_changes = Changes(), Changes()
+        self._scene_changes = Changes()
         self._shown: Clip | None = None  # what the widgets were last set to
         self._dragged: Box | None = None  # the box as a handle has set it, until the session stores it
-        self._held = False
+        self._held: int | None = None  # the browser that holds a handle
+        self._session = -1
         self._lines: viser.LineSegmentsHandle | None = None
         self._handles: dict[int, viser.TransformControlsHandle] = {}
         self._first: Spot | None = None
@@ -100,11 +101,13 @@ class ClipPanel:
     def draw(self, current: Snapshot) -> None:
         """Show the box of the session; while a handle is held, the box as dragged."""
         clip = current.clip
+        if self._held is not None and self._held not in self._page.server.get_clients():
+            self._held = self._dragged = None  # a browser that is gone lets nothing go
         if clip != self._shown:
             self._shown, self._dragged = clip, None
             self._show(clip)
-        if self._first is not None and not self._measure.picking:
-            self._first = None
+        if current.session != self._session or not self._measure.picking:
+            self._session, self._first = current.session, None
         cutting = self._measure.taker == self._picked
         self._asked.visible = cutting
         self._asked.content = panel("note", f"Click the {'first' if self._first is None else 'other'} end on the map.")
@@ -208,7 +211,7 @@ class ClipPanel:
             self._lines = add_lines(scene, f"{_NODE}/edges", lines, _COLOUR, 2.0)
         else:
             self._lines.points = lines
-        if self._pull.value and not self._held:
+        if self._pull.value and self._held is None:
             self._place_handles(box)
 
     def _place_handles(self, box: Box) -> None:
@@ -246,8 +249,8 @@ class ClipPanel:
                 box = carried(box, lie.matrix(np.array([x, y, z, w])), place)
             else:
                 box = pulled(box, *FACES[number], place)
-            self._dragged, self._held = box, event.phase != "end"
-            if not self._held:
+            self._dragged, self._held = box, None if event.phase == "end" else event.client.client_id
+            if self._held is None:
                 self._send(box=box)
 
         return moved

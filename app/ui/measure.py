@@ -16,7 +16,7 @@ from app.slam.types import F64
 from app.ui.corners import snapped
 from app.ui.html import panel
 from app.ui.measure_maths import Numbers, as_csv, load, meet, numbers, places, words
-from app.ui.nodes import add_exact_points, add_lines, clear, segments
+from app.ui.nodes import add_exact_points, add_lines, clear, label_text, segments
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, add_button, ask_text, by_user, show
 
@@ -43,6 +43,7 @@ class MeasurePanel:
         self._where: GeoReference | None = None
         self._click: tuple[F64, F64, float] | None = None  # of the newest click: its ray in the map, and its width
         self._spots: tuple[Spot, ...] = ()  # of the measure that is begun
+        self._session = -1  # that they are of
         self._nodes: list[Any] = []
         self._measured: list[tuple[Measure, F64, Numbers]] = []
         self._map: tuple[object, object] = None, None  # chunks and poses that they are of
@@ -74,6 +75,8 @@ class MeasurePanel:
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Take the newest click, and show what the session keeps."""
+        if current.session != self._session:  # the spots are on another walk
+            self._session, self._spots = current.session, ()
         click, self._click = self._click, None
         poses = current.keyframe_poses
         kind = self._kind
@@ -182,4 +185,5 @@ class MeasurePanel:
 
 def _label(name: str, at: F64, found: Numbers) -> str:
     """In the scene: a distance or angle with its number. The coordinates of a point would cover the map around it."""
-    return name if len(at) == 1 else f"{name}: {words(at, found).split(': ')[0]}"
+    short = label_text(name)
+    return short if len(at) == 1 else f"{short}: {words(at, found).split(': ')[0]}"

@@ -15,6 +15,8 @@ TRUTH_COLOUR: Final = (120, 150, 255)
 BLOCK: Final = 256
 """Segments per node: a new frame sends only the newest node again, not an hour's path."""
 _MOST_TRUTH_POINTS: Final = 4000
+_LABEL_TEXT: Final = 32
+"""Letters of what a user wrote that a label in the scene shows."""
 
 NO_POINTS: Final = np.zeros((1, 3), np.float32)
 NO_COLOURS: Final = np.zeros((1, 3), np.uint8)
@@ -29,6 +31,11 @@ def _posed(T: F64 | None) -> dict[str, Any]:
 def place(node: viser.SceneNodeHandle, T: F64) -> None:
     """Move a node to a pose (3 or 4, 4) in its parent's frame."""
     node.wxyz, node.position = wxyz(T[:3, :3]), T[:3, 3]
+
+
+def label_text(text: str) -> str:
+    """What a label in the scene shows of a text, which may be long: all of it would cover the map."""
+    return text if len(text) <= _LABEL_TEXT else text[: _LABEL_TEXT - 1].rstrip() + "…"
 
 
 def clear(nodes: list[Any]) -> None:

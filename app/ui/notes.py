@@ -11,14 +11,12 @@ from app.server.protocol import Seek, Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import F64
 from app.ui.html import panel
-from app.ui.nodes import add_exact_points, clear
+from app.ui.nodes import add_exact_points, clear, label_text
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, add_button, ask_text, show
 
 _SHOWN_NOTES: Final = 30
 _PINNED: Final = 100
-_PIN_TEXT: Final = 32
-"""Letters of a note on its pin."""
 _PIN_COLOUR: Final = (255, 190, 60)
 _PIN_M: Final = 0.16
 _REACH_PX: Final = 14.0
@@ -116,7 +114,4 @@ def pins(notes: tuple[Note, ...], frames: int) -> list[tuple[int, str]]:
     for note in notes[-_PINNED:]:
         if 0 <= note.frame < frames:
             texts[note.frame] = f"{texts[note.frame]} · {note.text}" if note.frame in texts else note.text
-    return [
-        (frame, text if len(text) <= _PIN_TEXT else text[: _PIN_TEXT - 1].rstrip() + "…")
-        for frame, text in texts.items()
-    ]
+    return [(frame, label_text(text)) for frame, text in texts.items()]

@@ -25,7 +25,7 @@ from app.ui.measure import MeasurePanel
 from app.ui.measure_maths import meet
 from app.ui.profile import ProfileNode, unrolled
 from app.ui.widgets import View
-from tests.ui.conftest import BusyThreads, Wire, browser_sends, clouds, page_of, user_sets
+from tests.ui.conftest import BusyThreads, Wire, browser_sends, clouds, finish, page_of, user_sets
 
 BOX = Box.around((4.0, -2.0, 1.0), (6.0, 2.0, 3.0), 30.0)
 RANDOM = np.random.default_rng(5)
@@ -257,6 +257,41 @@ def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.V
     np.testing.assert_allclose(box.middle[:2], [10.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(box.size[:2], [20.0, 0.5])
     assert len(bench.faced) == 1 and not bench.measure.picking
+
+
+def test_a_cut_that_is_begun_is_not_ended_in_another_recording(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.draw()
+    bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
+    bench.panel._picked(Spot(0, (0.0, 0.0, 0.0)), bench.now)
+    bench.draw()
+    assert "other end" in bench.panel._asked.content
+    bench.now = replace(bench.now, session=bench.now.session + 1)
+    bench.draw()
+    assert "first end" in bench.panel._asked.content
+    bench.panel._picked(Spot(2, (0.0, 0.0, 0.0)), bench.now)
+    assert bench.now.clip.box is None and bench.measure.picking
+
+
+def test_a_handle_that_a_lost_browser_held_is_free_again(
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, connected = Bench(server), {7: SimpleNamespace(client_id=7)}
+    monkeypatch.setattr(server, "get_clients", lambda: connected)
+    bench.now = replace(bench.now, clip=Clip(BOX, on=True))
+    bench.draw()
+    gizmo = SimpleNamespace(position=handle(BOX, 0, 1)[1] + 1.0, wxyz=(1.0, 0.0, 0.0, 0.0))
+    event = SimpleNamespace(client=connected[7], target=gizmo, phase="update")
+    finish(bench.panel._noting(FACES.index((0, 1)))(event))
+    bench.draw()
+    assert bench.panel._dragged is not None
+    connected.clear()
+    bench.draw()
+    np.testing.assert_allclose(bench.panel._lines.points, edges(BOX))  # type: ignore[union-attr]
+    moved = Box.around(BOX.middle + 2.0, BOX.size, BOX.turn)
+    bench.now = replace(bench.now, clip=Clip(moved, on=True))
+    bench.draw()
+    np.testing.assert_allclose(bench.panel._handles[-1].position, moved.middle, atol=1e-6)
 
 
 def test_a_profile_stands_in_the_place_of_the_map(server: viser.ViserServer) -> None:

@@ -194,6 +194,29 @@ def test_the_label_in_the_scene_is_short(
     assert [m.props.text for m in wire.messages if type(m).__name__ == "LabelMessage"][-1] == label
 
 
+def test_a_long_name_leaves_its_number_on_the_label(server: viser.ViserServer, wire: Wire) -> None:
+    bench = Bench(server)
+    bench.panel._name.value = "the north-east corner of the old refectory " * 5
+    bench.panel.begin(DISTANCE)
+    bench.click(0.0, 0.0)
+    bench.click(0.5, 0.0)
+    bench.keep()
+    label = [m.props.text for m in wire.messages if type(m).__name__ == "LabelMessage"][-1]
+    assert label == "the north-east corner of the ol…: 0.517 m"
+
+
+def test_a_measure_that_is_begun_is_not_ended_in_another_recording(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.panel.begin(DISTANCE)
+    bench.click(0.0, 0.0)
+    bench.now = replace(bench.now, session=bench.now.session + 1)
+    bench.click(0.5, 0.0)
+    assert not bench.sent and "Distance: click 1 more point of the map." in bench.panel._asked.content
+    bench.click(0.0, 0.5)
+    (command,) = bench.sent
+    assert isinstance(command, KeepMeasure) and len(command.measure.spots) == 2
+
+
 def test_a_measure_of_what_is_not_here_yet_is_still_counted(server: viser.ViserServer) -> None:
     bench = Bench(server)
     bench.panel.begin(POINT)
