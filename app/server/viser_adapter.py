@@ -35,8 +35,9 @@ TITLE: Final = "<title>Viser</title>"
 BODY_END: Final = "</body>"
 
 BADGE: Final = (
-    '<div style="position:fixed;left:50%;top:8px;transform:translateX(-50%);z-index:9999;pointer-events:none;'
-    'padding:2px 12px;border-radius:12px;background:#ffb020;color:#10151c;font:600 12px system-ui,sans-serif">'
+    '<div class="hs-view-only" style="position:fixed;left:50%;top:8px;'
+    "transform:translateX(-50%);z-index:9999;pointer-events:none;padding:2px 12px;"
+    'border-radius:12px;background:#ffb020;color:#10151c;font:600 12px system-ui,sans-serif">'
     "View only: controls have no effect</div>"
 )
 

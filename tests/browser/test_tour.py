@@ -1,9 +1,12 @@
 """The tour of a first visit, and what the page's own script tells the server."""
 
+import json
+
 import pytest
 from playwright.sync_api import Browser, expect
 
 from app.server.protocol import Pause, Play, SetSpeed, StepFrame
+from app.server.viser_adapter import BADGE
 from tests.browser.conftest import ALPHA, SLIDERS, Bench, new_page
 
 
@@ -37,6 +40,23 @@ def test_the_first_visit_is_shown_around_once(bench: Bench, chromium: Browser) -
         page.get_by_role("button", name="Tour of one minute").click()
         page.keyboard.press("Escape")
         expect(tour).to_have_count(0)
+    finally:
+        page.close()
+
+
+def test_who_may_only_view_is_not_told_what_to_try(bench: Bench, chromium: Browser) -> None:
+    page = new_page(chromium, 1000, 620, tour=True)
+    page.add_init_script(
+        "document.addEventListener('DOMContentLoaded', () => "
+        f"document.body.insertAdjacentHTML('beforeend', {json.dumps(BADGE)}))"
+    )
+    try:
+        page.goto(bench.url)
+        expect(page.get_by_text("View only")).to_be_visible()
+        expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+        page.wait_for_function("Boolean(window.hemislamTour)")
+        page.wait_for_timeout(3500)  # it would begin after 1.5 s, or 1 s later
+        assert not page.get_by_role("dialog", name="Tour").count()
     finally:
         page.close()
 

@@ -51,7 +51,7 @@ if (!window.hemislamTour) {
   const first = () => { try { return !localStorage.getItem('hemislam-tour'); } catch { return false; } };
   const wait = () => { // until there is something to show
     const node = document.querySelector('.hs-state');
-    if (!first()) return;
+    if (!first() || document.querySelector('.hs-view-only')) return; // nobody is told to try what has no effect
     if (node && JSON.parse(node.dataset.state).open && document.querySelector('body > * .hs-transport')) window.hemislamTour();
     else setTimeout(wait, 1000);
   };
