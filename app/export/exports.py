@@ -3,6 +3,7 @@
 `save_results` writes them from the frames of a session, at any moment.
 """
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -188,12 +189,24 @@ def save_results(
 ) -> dict[str, Any]:
     """Write these result files and return what report.json holds.
 
-    Older results in the folder stay until all new files are complete.
+    Older results in the folder stay until all new files are complete. A folder that was made for nothing is removed.
 
     Raises:
         HemislamError: as `prepare_folder`, or the disk is full or fails, or a file needs a georeference.
     """
+    new = not folder.exists()
     prepare_folder(folder, replace=replace)
+    try:
+        return _write_results(folder, results, exports)
+    except HemislamError:
+        if new:
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
+        raise
+
+
+def _write_results(folder: Path, results: Results, exports: Sequence[Export]) -> dict[str, Any]:
+    """As `save_results`, into a folder that is there."""
     written = [export for export in exports if results.loops or not export.of_loops]
     if results.where is None and (lost := [export.name for export in written if export.on_earth]):
         unknown = f"{lost[0]} needs a georeferenced map; use Georeference in the page, or `hemislam georeference`."

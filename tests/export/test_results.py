@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from app.export.box import Box
-from app.export.exports import BY_RUN, EXPORTS, save_results
+from app.export.exports import BY_RUN, EXPORTS, of_formats, save_results
 from app.export.folder import read_results
 from app.export.map_file import KEYFRAME, VERTEX, MapFile, write
 from app.export.points import Choice, blocks
@@ -296,6 +296,16 @@ def test_older_results_survive_a_write_that_fails(tmp_path: Path, recording: Pat
     with pytest.raises(HemislamError, match="No space left"):
         save_results(folder, Results(logged(9), BrokenDisk(), info), replace=True)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("format", ["section", "gpx"])
+def test_what_cannot_be_written_leaves_no_empty_folder(tmp_path: Path, recording: Path, format: str) -> None:
+    results, mine = Results(logged(), [], RunInfo(recording, Params())), tmp_path / "mine"
+    mine.mkdir()
+    for folder in (tmp_path / "out", mine):
+        with pytest.raises(HemislamError):
+            save_results(folder, results, of_formats([format]))
+    assert list(tmp_path.glob("*/")) == [mine], "it was there before"
 
 
 def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path, recording: Path) -> None:
