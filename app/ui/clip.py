@@ -201,6 +201,7 @@ class ClipPanel:
             for gizmo in self._handles.values():
                 gizmo.remove()
             self._handles.clear()
+            self._held = self._dragged = None  # no browser tells that it lets go of what is gone
         if box is None:
             if self._lines is not None:
                 self._lines.remove()

@@ -187,6 +187,16 @@ class Bench:
     def draw(self) -> None:
         self.panel.draw(self.now)
 
+    def drag(self, client: Any) -> None:
+        """Show `BOX`, and begin to drag a side of it in a browser, which does not let go."""
+        self.now = replace(self.now, clip=Clip(BOX, on=True))
+        self.draw()
+        gizmo = SimpleNamespace(position=handle(BOX, 0, 1)[1] + 1.0, wxyz=(1.0, 0.0, 0.0, 0.0))
+        event = SimpleNamespace(client=client, target=gizmo, phase="update")
+        finish(self.panel._noting(FACES.index((0, 1)))(event))
+        self.draw()
+        assert self.panel._dragged is not None
+
 
 def test_switched_on_it_holds_the_map_and_shows_its_handles(server: viser.ViserServer, wire: Wire) -> None:
     bench = Bench(server)
@@ -273,18 +283,26 @@ def test_a_cut_that_is_begun_is_not_ended_in_another_recording(server: viser.Vis
     assert bench.now.clip.box is None and bench.measure.picking
 
 
+def test_a_box_that_is_hidden_while_it_is_dragged_has_its_handles_again_later(
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another page hides it; the one that drags then says nothing more."""
+    bench, dragging = Bench(server), SimpleNamespace(client_id=7)
+    monkeypatch.setattr(server, "get_clients", lambda: {7: dragging})
+    bench.drag(dragging)
+    for on in (False, True):
+        bench.now = replace(bench.now, clip=Clip(BOX, on=on))
+        bench.draw()
+    assert len(bench.panel._handles) == 7
+    np.testing.assert_allclose(bench.panel._lines.points, edges(BOX))  # type: ignore[union-attr]
+
+
 def test_a_handle_that_a_lost_browser_held_is_free_again(
     server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench, connected = Bench(server), {7: SimpleNamespace(client_id=7)}
     monkeypatch.setattr(server, "get_clients", lambda: connected)
-    bench.now = replace(bench.now, clip=Clip(BOX, on=True))
-    bench.draw()
-    gizmo = SimpleNamespace(position=handle(BOX, 0, 1)[1] + 1.0, wxyz=(1.0, 0.0, 0.0, 0.0))
-    event = SimpleNamespace(client=connected[7], target=gizmo, phase="update")
-    finish(bench.panel._noting(FACES.index((0, 1)))(event))
-    bench.draw()
-    assert bench.panel._dragged is not None
+    bench.drag(connected[7])
     connected.clear()
     bench.draw()
     np.testing.assert_allclose(bench.panel._lines.points, edges(BOX))  # type: ignore[union-attr]
