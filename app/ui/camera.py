@@ -272,8 +272,10 @@ class CameraPanel:
         """
         self._look_freely(client)
         self._make_parallel(client)
-        half = 0.6 * max(size[1], size[0] / self._framing.picture(client).shape, 1.0)
-        self._go(client, Stand(middle - axes[:, 1] * half / np.tan(FOV / 2), middle))
+        picture = self._framing.picture(client)
+        half = 0.6 * max(size[1] / (1 - picture.covered), size[0] / picture.shape, 1.0)
+        look_at = middle - axes[:, 2] * half * picture.covered  # in the middle of what is not covered
+        self._go(client, Stand(look_at - axes[:, 1] * half / np.tan(FOV / 2), look_at))
 
     def _choose_lens(self, name: str, client: viser.ClientHandle) -> None:
         self._made_parallel.discard(client.client_id)

@@ -247,6 +247,16 @@ def test_each_browser_has_a_lens_of_its_own(server: viser.ViserServer, framed: F
     assert mine.camera.fov < 0.1 and other.camera.fov == FOV, "a lens that a person chose stays"
 
 
+def test_the_floor_of_a_section_is_above_what_covers_the_scene(server: viser.ViserServer, framed: Framed) -> None:
+    framing, browser, _ = framed
+    framing.cover(browser, 300)  # type: ignore[arg-type]
+    panel = CameraPanel(page_of(server), framing, lambda _: None)
+    panel.face(browser, np.array([5.0, 2.0, 4.0]), (3.0, 8.0))  # type: ignore[arg-type]
+    stand, picture = Stand(browser.camera.position, browser.camera.look_at), Picture(browser.camera.fov, 1.6, 0.3)
+    floor, ceiling = seen(np.array([[5.0, 2.0, 0.0], [5.0, 2.0, 8.0]]), stand, picture)[:, 1]
+    assert -0.4 < floor < -0.2 and 0.8 < ceiling < 1.0
+
+
 def test_a_view_is_kept_in_the_session_and_gone_back_to(server: viser.ViserServer, framed: Framed) -> None:
     framing, browser, _ = framed
     browser.camera.position, browser.camera.look_at = np.array([3.0, 4.0, 20.0]), np.array([3.0, 0.0, 1.0])
