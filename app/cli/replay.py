@@ -35,7 +35,8 @@ def replay(
       hemislam replay runs/sessions/walk-20261121-101500.hemislam
       hemislam replay session.hemislam --to-end --out results/walk
     """
-    from app.cli.run import free_folder, results_folder, save
+    from app.cli.run import free_folder, save
+    from app.export.exports import results_folder
 
     folder = out or free_folder(session)
     with results_folder(folder, replace=force), repeat(session, to_end=to_end) as (work, stop):

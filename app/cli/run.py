@@ -66,6 +66,7 @@ def run(
       hemislam run walk.mcap --loops edits.yaml
     """
     from app.evaluation.truth import check_poses
+    from app.export.exports import results_folder
     from app.mapping.opening import open_session
     from app.slam.doubts import doubts
     from app.slam.loops import edit_files
@@ -106,23 +107,6 @@ def run(
             save(session, folder, stop, replace=force)
     finally:
         session.close()
-
-
-@contextlib.contextmanager
-def results_folder(folder: Path, *, replace: bool) -> Iterator[None]:
-    """While results are made for a folder: one that is empty in the end, since there are none, is removed.
-
-    Raises:
-        HemislamError: as `prepare_folder`.
-    """
-    from app.export.exports import prepare_folder
-
-    prepare_folder(folder, replace=replace)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            folder.rmdir()  # only if it is empty
 
 
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:

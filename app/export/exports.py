@@ -7,7 +7,7 @@ import contextlib
 import importlib.util
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -168,12 +168,14 @@ def of_formats(formats: Sequence[str]) -> tuple[Export, ...]:
     return chosen
 
 
-def prepare_folder(folder: Path, *, replace: bool = False) -> None:
-    """Make sure that results can be written to `folder`, creating it.
+@contextlib.contextmanager
+def results_folder(folder: Path, *, replace: bool = False) -> Iterator[None]:
+    """While results are made for a folder, which is created; if there are none in the end, it is removed again.
 
     Raises:
         HemislamError: the folder holds results and `replace` is not set, or it is not writable.
     """
+    new = not folder.exists()
     make_folder(folder)
     held = [export.name for export in BY_RUN if (folder / export.name).exists()]
     if held and not replace:
@@ -182,6 +184,12 @@ def prepare_folder(folder: Path, *, replace: bool = False) -> None:
         )
     if not os.access(folder, os.W_OK | os.X_OK):
         raise HemislamError(f"The folder {folder} is not writable; choose another one.")
+    try:
+        yield
+    finally:
+        if new:
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
 
 
 def save_results(
@@ -189,20 +197,13 @@ def save_results(
 ) -> dict[str, Any]:
     """Write these result files and return what report.json holds.
 
-    Older results in the folder stay until all new files are complete. A folder that was made for nothing is removed.
+    Older results in the folder stay until all new files are complete.
 
     Raises:
-        HemislamError: as `prepare_folder`, or the disk is full or fails, or a file needs a georeference.
+        HemislamError: as `results_folder`, or the disk is full or fails, or a file needs a georeference.
     """
-    new = not folder.exists()
-    prepare_folder(folder, replace=replace)
-    try:
+    with results_folder(folder, replace=replace):
         return _write_results(folder, results, exports)
-    except HemislamError:
-        if new:
-            with contextlib.suppress(OSError):  # it holds something
-                folder.rmdir()
-        raise
 
 
 def _write_results(folder: Path, results: Results, exports: Sequence[Export]) -> dict[str, Any]:
