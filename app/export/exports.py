@@ -175,8 +175,7 @@ def results_folder(folder: Path, *, replace: bool = False) -> Iterator[None]:
     Raises:
         HemislamError: the folder holds results and `replace` is not set, or it is not writable.
     """
-    new = not folder.exists()
-    make_folder(folder)
+    new = make_folder(folder)
     held = [export.name for export in BY_RUN if (folder / export.name).exists()]
     if held and not replace:
         raise HemislamError(
@@ -209,6 +208,8 @@ def save_results(
 def _write_results(folder: Path, results: Results, exports: Sequence[Export]) -> dict[str, Any]:
     """As `save_results`, into a folder that is there."""
     written = [export for export in exports if results.loops or not export.of_loops]
+    if not written:
+        raise HemislamError(f"{exports[0].name} exists only if loops are searched; switch them on (loops.enabled).")
     if results.where is None and (lost := [export.name for export in written if export.on_earth]):
         unknown = f"{lost[0]} needs a georeferenced map; use Georeference in the page, or `hemislam georeference`."
         raise HemislamError(results.problem or unknown)

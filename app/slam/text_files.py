@@ -41,12 +41,14 @@ def is_file(path: Path) -> bool:
     return False
 
 
-def make_folder(folder: Path) -> None:
-    """Raises HemislamError if the folder cannot be created."""
+def make_folder(folder: Path) -> bool:
+    """Whether the folder was not there yet. Raises HemislamError if it cannot be created."""
     try:
+        new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise HemislamError(f"The folder {folder} cannot be made: {error.strerror}; choose another one.") from None
+    return new
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:

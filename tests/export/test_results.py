@@ -298,7 +298,7 @@ def test_older_results_survive_a_write_that_fails(tmp_path: Path, recording: Pat
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("format", ["section", "gpx"])
+@pytest.mark.parametrize("format", ["section", "gpx", "g2o"])
 def test_what_cannot_be_written_leaves_no_empty_folder(tmp_path: Path, recording: Path, format: str) -> None:
     results, mine = Results(logged(), [], RunInfo(recording, Params())), tmp_path / "mine"
     mine.mkdir()
