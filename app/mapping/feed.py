@@ -42,6 +42,13 @@ class FeedInfo:
     findings: tuple[Finding, ...] = field(default=())
     fixes: bool = False
 
+    @property
+    def end_s(self) -> float | None:
+        """Of the part that is processed, s after `start_ns`; None if the source has no end yet."""
+        if self.duration_s is None or self.part_s is None:
+            return self.duration_s
+        return min(self.start_s + self.part_s, self.duration_s)
+
 
 class Feed(Protocol):
     """A source of measurements in order of time. Subclass it: only `info` and `next` are required.

@@ -196,11 +196,11 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class OpenedRecording:
-    """The open recording."""
+    """The open recording, or the part of it that is processed: from `start_s` to `end_s` after `start_ns`."""
 
     path: Path
     start_ns: int
-    duration_s: float
+    end_s: float
     frames: int
     findings: tuple[Finding, ...]
     truth_stamps_ns: I64 | None = None
@@ -209,6 +209,11 @@ class OpenedRecording:
     truth: Path | None = None
     fixes: bool = False
     """Whether it holds satellite fixes."""
+    start_s: float = 0.0
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,20 +29,21 @@ SAVED_KEPT = 10
 
 
 def opened_recording(session: Session) -> OpenedRecording:
-    """Describe a session's source. One without an end is as long as the part that was processed."""
+    """Describe a session's source. One without an end is as long as what was processed."""
     info, truth = session.feed.info, session.truth
     newest = session.frames[session.frame] if session.frame >= 0 else None
     so_far_s = (newest.stamp_ns - info.start_ns) * 1e-9 if newest is not None else 0.0
     return OpenedRecording(
         path=info.path,
         start_ns=info.start_ns,
-        duration_s=so_far_s if info.duration_s is None else info.duration_s,
+        end_s=so_far_s if info.end_s is None else info.end_s,
         frames=session.frame + 1 if info.frames is None else info.frames,
         findings=session.findings,
         truth_stamps_ns=truth.stamps_ns if truth else None,
         truth_positions=truth.positions if truth else None,
         truth=session.truth_path,
         fixes=info.fixes,
+        start_s=info.start_s,
     )
 
 

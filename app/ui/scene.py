@@ -105,7 +105,7 @@ class Scene:
         start_ns = recording.start_ns if recording else 0
         if current.session != self._session:
             self._session, self._shown, self._framed = current.session, None, 0
-            self.chunks.clear(start_ns, recording.duration_s if recording else 1.0)
+            self.chunks.clear(start_ns, recording.end_s if recording else 1.0)
             self._sensor.clear()
         self._grid.visible = view.grid
         if view.light != self._light:

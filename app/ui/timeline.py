@@ -202,6 +202,7 @@ def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
     return {
         "frames": history.total,
         "present": history.present,
+        "start": recording.start_s if recording else 0.0,
         "duration": recording.duration_s if recording else 1.0,
         "starts": columns.starts.tolist(),
         "stamps": packed(columns.stamps),

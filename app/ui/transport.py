@@ -144,8 +144,8 @@ def where(snapshot: Snapshot) -> str:
             "quiet", f"{recording.frames:,} frames, {recording.duration_s:.1f} s. Press Play, or → for one frame."
         )
     seconds = number((transport.stamp_ns - recording.start_ns) * 1e-9)
-    of, duration = f" of 0–{recording.frames - 1:,}", f" of {number(recording.duration_s, 1)} s"
-    return panel("where", frame, of, seconds, duration, stamp, rate)
+    of, end = f" of 0–{recording.frames - 1:,}", f" of {number(recording.end_s, 1)} s"
+    return panel("where", frame, of, seconds, end, stamp, rate)
 
 
 def done(progress: Progress | None) -> float:

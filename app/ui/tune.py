@@ -180,7 +180,7 @@ class TunePanel:
         if length is None:
             return 0.0, None
         begin = round(max((here - start_ns) * 1e-9, 0.0), 1)
-        if (left := snapshot.recording.duration_s - begin) < _LEAST_S:
+        if (left := snapshot.recording.end_s - begin) < _LEAST_S:
             raise HemislamError(
                 f"Only {max(left, 0.0):.1f} s of the recording are left from here; go back to a part that shows the "
                 "trouble, or choose the whole recording."

@@ -1,4 +1,4 @@
-"""A recording read ahead by a thread gives what it gives without."""
+"""A recording, or a part of it; read ahead by a thread it gives what it gives without."""
 
 from pathlib import Path
 
@@ -40,6 +40,14 @@ def test_damage_is_reported_after_the_same_measurements(tmp_path: Path) -> None:
     ahead, ended = read(damaged, read_ahead=True)
     assert ahead and ended
     assert read(damaged, read_ahead=False) == (ahead, ended)
+
+
+@pytest.mark.parametrize(("part", "end"), [((2.0, 3.0), 5.0), ((80.0, 60.0), 83.9), ((2.0, None), 83.9)])
+def test_it_is_known_where_a_part_ends_and_how_many_scans_it_has(part: tuple[float, float | None], end: float) -> None:
+    feed = FileFeed(SAMPLE, Params(), *part)
+    feed.close()
+    assert feed.info.end_s == pytest.approx(end, abs=0.05)
+    assert feed.info.frames == pytest.approx(10 * (end - part[0]), abs=1)
 
 
 @pytest.mark.parametrize("count", [0, 3])

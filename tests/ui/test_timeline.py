@@ -167,6 +167,10 @@ def test_troubles_are_where_a_red_stretch_begins_without_slow_frames_and_loops()
 
 def test_frames_slower_than_the_sensor_are_red() -> None:
     assert limits(snapshot(1, 100))["took"] == pytest.approx(100.0)
+    whole = snapshot(1, 100)
+    assert whole.recording is not None
+    part = replace(whole, recording=replace(whole.recording, start_s=4.0, frames=60))
+    assert limits(part)["took"] == pytest.approx(100.0)
 
 
 @given(st.lists(st.one_of(st.floats(0, 1e4), st.just(float("nan"))), min_size=1, max_size=40))

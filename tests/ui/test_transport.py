@@ -111,6 +111,16 @@ def test_the_stamp_is_exact_to_the_millisecond(engine: FakeEngine) -> None:
     assert "frames/s" not in text, "nothing plays"
 
 
+def test_a_part_of_a_recording_has_its_own_end_and_length(engine: FakeEngine) -> None:
+    recording = engine.snapshot.recording
+    assert recording is not None
+    engine.publish(recording=replace(recording, start_s=10.0, frames=300))
+    assert "300 frames, 30.0 s" in where(engine.snapshot)
+    engine.publish(transport=replace(engine.snapshot.transport, frame=0, stamp_ns=recording.start_ns + 10_100_000_000))
+    text = where(engine.snapshot)
+    assert "frame <b>0</b> of 0–299" in text and "<b>10.10</b> of 40.0 s" in text
+
+
 def test_the_bar_is_sent_four_times_a_second_while_playing_and_ends_at_the_frame_it_stops_at(
     transport: Transporting, wire: Wire
 ) -> None:

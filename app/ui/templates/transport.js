@@ -62,7 +62,7 @@ function draw() {
   const gw = W - NAME - VALUE, C = d.starts.length, X = (frame) => NAME + frame / d.frames * gw;
   const at = columnOf(hover ?? Math.max(d.present, 0)), end = (c) => c + 1 < C ? d.starts[c + 1] : d.frames;
   const first = d.starts[at], last = end(at) - 1, stamp = d.stamps[at];
-  const seconds = isNaN(stamp) ? first / d.frames * d.duration : stamp;
+  const seconds = isNaN(stamp) ? d.start + first / d.frames * d.duration : stamp;
   const which = last > first ? `frames ${first.toLocaleString('en')}–${last.toLocaleString('en')}`
     : `frame ${first.toLocaleString('en')}`;
   say(`${which} · ${seconds.toFixed(2)} s`, W - 8, HEAD / 2, hover === null ? QUIET : TEXT, 'right');
