@@ -71,7 +71,8 @@ def judge(
     reason = _objection(found, evidence, params, FAR_M if paused else NEAR_M) or (
         "" if broken else _far_off(found.deviation, evidence, params)
     )
-    return edge(T, covariance(detector, newer, fit, found.open), evidence, reason)
+    unsure = doubtful(found, guess, expectation.covariance(older)[3:, 3:])
+    return edge(T, covariance(detector, newer, fit, *unsure), evidence, reason)
 
 
 def _place(
@@ -117,20 +118,41 @@ def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
     return LoopEdge(older, newer, newer, T, sigma, evidence, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
 
 
-def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = None) -> F64:
+def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = None, sigma_m: float = 0.0) -> F64:
     """(6, 6) of a registration, rotation then translation, in the newer's IMU frame.
 
     Args:
-        along: (3,) unit, axes of the older's level frame; nothing holds it in this direction.
+        along: (3,) unit, axes of the older's level frame. sigma_m: standard deviation in this direction beyond what
+            the points tell.
     """
-    information = fit.information * (INDEPENDENT / POINT_M**2)
-    level = np.linalg.pinv(information) + np.diag([FLOOR_TILT**2] * 2 + [FLOOR_YAW**2] + [FLOOR_M**2] * 3)
+    level = _by_points(fit)
     if along is not None:
-        level[3:, 3:] += LOOSE_M**2 * np.outer(along, along)
+        level[3:, 3:] += sigma_m**2 * np.outer(along, along)
     R = (fit.T_target_source @ detector.T_level_imu(newer))[:3, :3]
     turn = np.kron(np.eye(2), R.T)
     out = turn @ level @ turn.T
     return np.asarray((out + out.T) / 2)
+
+
+def doubtful(place: Placement, T_guess: F64, odometry: F64) -> tuple[F64, float]:
+    """In which direction (3,) a registration is less certain than its points tell, and the standard deviation, m.
+
+    Nothing holds it there; or odometry, of covariance (3, 3) in the level frame, is the more certain. Then it may have
+    ended beside the truth, as between rows of parked cars, so it counts for less the more it contradicts odometry.
+    """
+    if place.open is not None:
+        return place.open, LOOSE_M
+    weakest = place.fit.directions[0]
+    if weakest @ odometry @ weakest >= weakest @ _by_points(place.fit)[3:, 3:] @ weakest:
+        return weakest, 0.0
+    return weakest, abs(float(weakest @ (place.fit.T_target_source - T_guess)[:3, 3]))
+
+
+def _by_points(fit: Fit) -> F64:
+    """(6, 6) covariance of a registration in the older's level frame, from its points alone."""
+    information = fit.information * (INDEPENDENT / POINT_M**2)
+    floor = np.diag([FLOOR_TILT**2] * 2 + [FLOOR_YAW**2] + [FLOOR_M**2] * 3)
+    return np.asarray(np.linalg.pinv(information) + floor)
 
 
 def _objection(place: Placement, e: Evidence, p: LoopsParams, near_m: float) -> str:

@@ -1,6 +1,6 @@
 """What a walk with drifting odometry comes to: loops found, its history, and what is shown of it.
 
-Tests app/slam/loops/files.py, app/slam/loops/search.py, app/slam/loops/verdicts.py.
+Tests app/slam/loops/files.py, app/slam/loops/search.py.
 """
 
 import csv
