@@ -209,7 +209,7 @@ def _write_results(folder: Path, results: Results, exports: Sequence[Export]) ->
     """As `save_results`, into a folder that is there."""
     written = [export for export in exports if results.loops or not export.of_loops]
     if not written:
-        raise HemislamError(f"{exports[0].name} exists only if loops are searched; switch them on (loops.enabled).")
+        raise HemislamError(f"There is no {exports[0].name}, because the loop search is off; set loops.enabled.")
     if results.where is None and (lost := [export.name for export in written if export.on_earth]):
         unknown = f"{lost[0]} needs a georeferenced map; use Georeference in the page, or `hemislam georeference`."
         raise HemislamError(results.problem or unknown)

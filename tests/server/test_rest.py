@@ -74,8 +74,9 @@ def test_exports_by_rest(site: Site) -> None:
         assert refused.status_code == 409 and "needs a georeferenced map" in refused.json()["detail"]
     refused = httpx.get(site.url("/api/export/section.svg"), timeout=TIMEOUT_S)
     assert refused.status_code == 409 and "box" in refused.json()["detail"]
-    without_loops = httpx.get(site.url("/api/export/graph.g2o"), timeout=TIMEOUT_S)
-    assert without_loops.status_code == 404 and "loop search is off" in without_loops.json()["detail"]
+    for name, status in (("graph.g2o", 409), ("loops.csv", 404)):
+        without_loops = httpx.get(site.url(f"/api/export/{name}"), timeout=TIMEOUT_S)
+        assert without_loops.status_code == status and "loop search is off" in without_loops.json()["detail"]
 
 
 def test_labels_by_rest(site: Site) -> None:
