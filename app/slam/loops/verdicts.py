@@ -71,8 +71,8 @@ def judge(
     reason = _objection(found, evidence, params, FAR_M if paused else NEAR_M) or (
         "" if broken else _far_off(found.deviation, evidence, params)
     )
-    unsure = doubtful(found, guess, expectation.covariance(older)[3:, 3:])
-    return edge(T, covariance(detector, newer, fit, *unsure), evidence, reason)
+    along = uncertainty_along(found, guess, expectation.covariance(older)[3:, 3:])
+    return edge(T, covariance(detector, newer, fit, *along), evidence, reason)
 
 
 def _place(
@@ -134,11 +134,12 @@ def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = Non
     return np.asarray((out + out.T) / 2)
 
 
-def doubtful(place: Placement, T_guess: F64, odometry: F64) -> tuple[F64, float]:
-    """In which direction (3,) a registration is less certain than its points tell, and the standard deviation, m.
+def uncertainty_along(place: Placement, T_guess: F64, odometry: F64) -> tuple[F64, float]:
+    """A direction (3,), and the standard deviation, m, to add along it to what a registration's points tell.
 
-    Nothing holds it there; or odometry, of covariance (3, 3) in the level frame, is the more certain. Then it may have
-    ended beside the truth, as between rows of parked cars, so it counts for less the more it contradicts odometry.
+    It is the direction that is open, or else the one that holds least. If odometry, of covariance (3, 3) in the level
+    frame, is the more certain along it, the registration may have ended beside the truth, as between rows of parked
+    cars. Then it counts for less the more it contradicts odometry.
     """
     if place.open is not None:
         return place.open, LOOSE_M
