@@ -3,10 +3,10 @@ if (!window.hemislamSay) {
   // A click (or Enter) on an element with data-hs: write its word into the hidden field, whose changes viser sends.
   // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, of
   // all controls together. So a word waits until nothing has changed for as long, not even by the word before; of two
-  // words that ask for the same thing the later one counts. On a busy page viser's timer may be late and run after ours,
-  // but it has run by the time of a further timer, which is set only then.
+  // words that ask for the same thing the later one counts, but every press that asks for a step does. On a busy page
+  // viser's timer may be late and run after ours, but it has run by the time of a further timer, which is set only then.
   const QUIET_MS = 60;
-  let said = 0, sending = 0, changed = -QUIET_MS;
+  let said = 0, presses = 0, sending = 0, changed = -QUIET_MS;
   const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set, waiting = new Map();
   for (const kind of ['input', 'click', 'keydown', 'pointermove']) {
     document.addEventListener(kind, (event) => {
@@ -32,7 +32,8 @@ if (!window.hemislamSay) {
     if (!element || (event.type === 'keydown' && (event.key !== 'Enter' || element.tagName === 'BUTTON'))) return;
     const name = element.closest('[data-hs-to]').dataset.hsTo, word = element.dataset.hs;
     if (event.detail > 1 && /^(delete|drop) /.test(word)) return; // of a double click, the second one meets the next line
-    waiting.set(name + ' ' + word.split(' ')[0], [name, word]);
+    const [kind] = word.split(' '), press = kind === 'step' && !event.held ? ++presses : '';
+    waiting.set(`${name} ${kind} ${press}`, [name, word]);
     if (!sending) send(false);
   };
 
@@ -107,7 +108,8 @@ if (!window.hemislamSay) {
     if (!sideways(event)) return;
     event.stopPropagation();
     if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest('input,textarea,select')) return;
-    document.querySelector(`body > * .hs-dock [data-hs="step ${event.key === 'ArrowRight' ? 1 : -1}"]`)?.click();
+    const target = document.querySelector(`body > * .hs-dock [data-hs="step ${event.key === 'ArrowRight' ? 1 : -1}"]:enabled`);
+    if (target) window.hemislamSay({type: 'click', target, held: event.repeat}); // a held key steps as fast as the page can
   });
   // Space plays and pauses. Firefox would also click the focused button again when the key comes up.
   document.documentElement.addEventListener('keyup', (event) => {
