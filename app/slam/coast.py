@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import ground, iekf, lie
-from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, POS, ROT, VEL, Belief, Path, at_origin
+from app.slam.imu import BA, BG, DIM, EXT_POS, EXT_ROT, GRAV, KNOWN, POS, ROT, VEL, Belief, Path, at_origin
 from app.slam.kernels import motion
 from app.slam.kernels.registration import EDGE_ON, REPEATED, RESIDUAL_HUBER
 from app.slam.local_map import LocalMap
@@ -97,7 +97,7 @@ def standing(stamp_ns: int, R_odom_imu: F64, params: Params) -> Belief:
         The state, with gravity along -z of odom (m/s²), and its (DIM, DIM) covariance in rad, m, m/s, rad/s.
     """
     sigma = np.zeros(DIM)
-    sigma[ROT] = sigma[POS] = 1e-4
+    sigma[ROT] = sigma[POS] = KNOWN
     sigma[VEL], sigma[BG], sigma[BA], sigma[GRAV] = FIRST_SPEED, FIRST_RATE, 1e-3, 1e-3
     sigma[EXT_ROT] = sigma[EXT_POS] = 1e-6
     return at_origin(stamp_ns, R_odom_imu, np.zeros(3), sigma, params)

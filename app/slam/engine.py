@@ -18,7 +18,7 @@ from app.slam.lines import LineErrors
 from app.slam.local_map import LocalMap, MapState
 from app.slam.params import Params
 from app.slam.pause import Interruption
-from app.slam.prediction import predict
+from app.slam.prediction import Prediction, predict
 from app.slam.sections import SensorParams
 from app.slam.types import (
     F32,
@@ -50,6 +50,7 @@ class EngineProgress:
         paused: the pause after which there is no keyframe yet; None: there is none.
         doubt: how far odometry may be off since the last keyframe.
         ride: while a rest is awaited, where scans see the device if it rides evenly instead; else None.
+        bent: whether the map holds only one scan, deskewed at an unknown speed (`app.slam.fusion`).
     """
 
     frame: int = 0
@@ -65,6 +66,7 @@ class EngineProgress:
     paused: Interruption | None = None
     doubt: Doubt = field(default_factory=Doubt)
     ride: Belief | None = None
+    bent: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,13 +156,18 @@ class Engine:
         if begun.waiting:
             fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled.points)
         else:
-            fused = fuse(prediction, scan, points, sampled.points, reduced.source[sampled.source], self._map, p)
+            source, alike = reduced.source[sampled.source], self._alike(begun.belief, begun.samples, end_ns)
+            fused = fuse(prediction, scan, points, sampled.points, source, self._map, p, alike)
+        mapped = fused if begun.ride is None else self._followed(begun.ride, scan, samples, clock.sigma)
+        if mapped.anew:
+            mapped = replace(mapped, belief=imu.at_map_begin(mapped.belief, p.filter.estimate_extrinsics))
+            self._map.clear()
         status = FrameStatus.LOST if fused.lost else FrameStatus.TRACKING
         status = FrameStatus.INITIALISING if begun.waiting else status
         watch.lap("update")
 
-        posterior, paused = fused.belief, begun.paused
-        believed = prediction.covered and not fused.imu_wrong
+        posterior, paused = fused.belief if begun.waiting else mapped.belief, begun.paused
+        believed = prediction.covered and not (fused.imu_wrong or fused.anew)
         if status is FrameStatus.TRACKING and fused.registration.inliers and believed:
             if p.imu.learn_clock:
                 clock = clock.learnt(begun.samples, predicted, posterior.state)
@@ -170,12 +177,10 @@ class Engine:
         if paused is not None and not settling:
             posterior = pause.levelled(posterior)
             self._map.clear()
-        due = not (begun.waiting or settling) and (paused is not None or self._is_due(posterior))
+        due = not (begun.waiting or settling or fused.bent) and (paused is not None or self._is_due(posterior))
         if due and status is FrameStatus.TRACKING and paused is None and p.filter.learn_lines:
             lines = self._learnt(lines, posterior, fused.points, scan.ring)
-        ride = None if begun.ride is None else self._followed(begun.ride, scan, samples, clock.sigma)
-        if not begun.waiting:
-            self._insert(posterior, fused)
+        self._insert(mapped.belief if begun.waiting else posterior, mapped)
         watch.lap("insert")
 
         cloud = _kept(fused.points, surface.labels, scan)
@@ -220,7 +225,8 @@ class Engine:
             gyro=gyro,
             paused=paused if settling else None,
             doubt=doubt if keyframe is None else replace(doubt, metres=0.0),
-            ride=ride,
+            ride=mapped.belief if begun.waiting else None,
+            bent=mapped.bent,
         )
         return result
 
@@ -281,15 +287,21 @@ class Engine:
         self._map.clear()  # of what was seen while a rest was awaited
         return _Begun(started.belief, samples, before.floor, notice=started.notice)
 
-    def _followed(self, ride: Belief, scan: Scan, samples: ImuSamples, clock_sigma: float) -> Belief:
+    def _followed(self, ride: Belief, scan: Scan, samples: ImuSamples, clock_sigma: float) -> Fused:
         """Where scans see the device at the scan's end, in case it does not rest although its IMU feels so."""
         p = self.params
         prediction = predict(ride, samples, scan.end_ns, p.imu, clock_sigma)
         points = prediction.deskew(scan)
         sampled = self._grid.downsample(points, p.scan.voxel_size)
-        fused = fuse(prediction, scan, points, sampled.points, sampled.source, self._map, p)
-        self._insert(fused.belief, fused)
-        return fused.belief
+        alike = self._alike(ride, samples, scan.end_ns)
+        return fuse(prediction, scan, points, sampled.points, sampled.source, self._map, p, alike)
+
+    def _alike(self, belief: Belief, samples: ImuSamples, end_ns: int) -> Prediction | None:
+        """The prediction for a scan that is as bent as the only one in the map; None if that one is not bent."""
+        if not self._progress.bent:
+            return None
+        at_map_begin = imu.at_map_begin(belief, self.params.filter.estimate_extrinsics)
+        return predict(at_map_begin, samples, end_ns, self.params.imu, self._progress.clock.sigma)
 
     def _is_due(self, belief: Belief) -> bool:
         return keyframes.is_due(self._progress.T_odom_keyframe, belief.state.T_odom_imu, self.params.keyframe)

@@ -2,6 +2,9 @@
 
 Where the IMU tells how the device moved during the scan, the filter estimates the pose at its end (`iekf`). Otherwise
 the scan determines its own motion too (`coast`).
+
+A map that begins at an unknown speed begins with a bent scan. The next scan is bent alike and fits it as a rigid body.
+If that tells the speed in all directions, this scan is set straight and begins the map anew.
 """
 
 import contextlib
@@ -13,7 +16,7 @@ import numpy as np
 
 from app.slam import coast, iekf, imu
 from app.slam.coast import Course
-from app.slam.imu import Belief
+from app.slam.imu import VEL, Belief
 from app.slam.local_map import LocalMap
 from app.slam.params import Params
 from app.slam.prediction import Prediction
@@ -28,6 +31,9 @@ BETTER, SAME_PART = 0.5, 0.9
 """A scan that contradicts the IMU, and without it fits the map with at most this share of the residuals and at least
 this share of the points, shows that the IMU was wrong about the whole scan: it was knocked, or froze."""
 
+TOLD = 0.5
+"""m/s: a speed that is known better than this is told by the scans. It is a third of what a start in motion assumes."""
+
 
 @dataclass(frozen=True, slots=True)
 class Fused:
@@ -36,6 +42,8 @@ class Fused:
     points: (n, 3) m, the scan, deskewed. sampled: (m, 3) m, those that enter the map; both in the LiDAR frame.
     lost: whether the pose is a guess: the scan met too few planes, or nothing measures the speed any more.
     imu_wrong: whether the scan shows that the IMU was wrong about how the device moved during it.
+    bent: whether the points were deskewed at an unknown speed and begin the map.
+    anew: whether the map, which held such points, begins anew with these.
     """
 
     belief: Belief
@@ -44,19 +52,32 @@ class Fused:
     sampled: F32
     lost: bool = False
     imu_wrong: bool = False
+    bent: bool = False
+    anew: bool = False
 
 
 def fuse(
-    prediction: Prediction, scan: Scan, points: F32, sampled: F32, source: I32, local_map: LocalMap, params: Params
+    prediction: Prediction,
+    scan: Scan,
+    points: F32,
+    sampled: F32,
+    source: I32,
+    local_map: LocalMap,
+    params: Params,
+    alike: Prediction | None = None,
 ) -> Fused:
     """The prediction, corrected by a scan; unchanged if the map is empty or too little of it is met.
 
     Args:
         scan: as measured. points: (n, 3) m, deskewed by the prediction.
         sampled: (m, 3) m, the same, thinned. source: (m,) which points of the scan these are nearest to.
+        alike: if the map holds one bent scan, the same prediction from a pose that is known, where that scan ended.
     """
     if not local_map.voxels:
-        fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled)
+        unknown = prediction.covered and coast.is_unsure(prediction.belief)
+        fused = Fused(prediction.belief, NOT_REGISTERED, points, sampled, bent=unknown)
+    elif straight := _straight(alike, scan, sampled, source, local_map, params):
+        fused = straight
     elif prediction.course is None:
         fused = Fused(*_with_imu(prediction, sampled, local_map, params), points, sampled)
         if fused.registration.surprise > iekf.SURPRISING and prediction.evenly is not None:
@@ -97,6 +118,24 @@ def _by_scan(
         why = "there is no IMU" if prediction.path is None else "the IMU is silent"
         registration = replace(registration, reason=f"{registration.reason}, and {why}")
     return Fused(posterior, registration, points, points[source], lost=adrift)
+
+
+def _straight(
+    alike: Prediction | None, scan: Scan, sampled: F32, source: I32, local_map: LocalMap, params: Params
+) -> Fused | None:
+    """The scan, set straight by the speed that a map bent alike shows.
+
+    None if the map is not bent, or if some direction of the speed stays a guess.
+    """
+    if alike is None or alike.path is None or alike.gap:
+        return None
+    chosen = spread(sampled, params.filter.max_points, params.scan.voxel_size)
+    update = partial(iekf.update, alike.belief, chosen, local_map, params.filter)
+    posterior, registration = _attempted(alike.belief, update)
+    if np.linalg.eigvalsh(posterior.covariance[VEL, VEL])[-1] > TOLD**2:
+        return None
+    points = coast.deskew(scan, posterior.state, Course.measured(alike.path, alike.belief.state))
+    return Fused(posterior, registration, points, points[source], anew=True)
 
 
 def _better(fused: Fused, even: Prediction, scan: Scan, source: I32, local_map: LocalMap, params: Params) -> Fused:

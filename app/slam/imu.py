@@ -29,6 +29,8 @@ GAP_RATE, GAP_NOISE = 1.0, 1.0
 """rad/s, m/s²/√Hz: in a gap, standard deviation of the rate of turn and noise density of the acceleration; those of a
 walking person's hand."""
 
+KNOWN = 1e-4
+"""rad, m: standard deviation of a pose that defines odom, or at which the map begins."""
 WALKING = 1.5
 """m/s: standard deviation of a walking person's velocity while nothing is known of it."""
 BIAS_LEAPS = 0.005, 0.05
@@ -93,6 +95,19 @@ def seen_from_the_lidar(belief: Belief) -> Belief:
     follows = np.eye(DIM)
     follows[POSE, EXT] = mounting_to_pose(belief.state)
     return Belief(belief.state, follows @ belief.covariance @ follows.T)
+
+
+def at_map_begin(belief: Belief, extrinsics: bool) -> Belief:
+    """The belief if the map begins anew at its pose, which is then known; what is known of the rest is kept.
+
+    Args:
+        extrinsics: whether the mounting is refined.
+    """
+    covariance = belief.covariance.copy()
+    covariance[POSE] = covariance[:, POSE] = 0.0
+    covariance[POSE, POSE] = KNOWN**2 * np.eye(6)
+    begun = Belief(belief.state, covariance)
+    return seen_from_the_lidar(begun) if extrinsics else begun
 
 
 def propagate(

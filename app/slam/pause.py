@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.slam import coast, lie
-from app.slam.imu import BA, BG, DIM, EXT, GRAV, POS, ROT, VEL, WALKING, Belief, seen_from_the_lidar
+from app.slam.imu import BA, BG, DIM, EXT, GRAV, KNOWN, POS, ROT, VEL, WALKING, Belief, seen_from_the_lidar
 from app.slam.kernels import manifold
 from app.slam.params import Params
 from app.slam.start import BEFORE_NS
@@ -61,7 +61,7 @@ def resumed(
     """
     state, later = last.state, samples.stamps_ns > max(pause.begin_ns, scan.stamp_ns - BEFORE_NS)
     sigma = np.zeros(DIM)
-    sigma[ROT] = sigma[POS] = 1e-4  # the map begins at this pose
+    sigma[ROT] = sigma[POS] = KNOWN
     sigma[VEL], sigma[GRAV] = WALKING, TILTED
     if later.any():
         samples = samples.part(later)

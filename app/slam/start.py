@@ -12,6 +12,7 @@ from app.slam.imu import (
     EXT_POS,
     EXT_ROT,
     GRAV,
+    KNOWN,
     POS,
     ROT,
     VEL,
@@ -112,7 +113,7 @@ def has_ridden(ride: Belief, rest: Belief) -> bool:
 
 def _sigma() -> np.ndarray:
     sigma = np.zeros(DIM)
-    sigma[ROT] = sigma[POS] = 1e-4  # this pose defines odom
+    sigma[ROT] = sigma[POS] = KNOWN
     sigma[BA] = 0.05  # turn-on bias of a MEMS accelerometer; at rest it looks like gravity
     sigma[EXT_ROT], sigma[EXT_POS] = DRAWN
     return sigma

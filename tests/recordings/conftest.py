@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.sensors.presets import PRESETS
+from app.sensors.presets import PRESETS, resolve_params
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
 from app.slam.metrics import GroundScore, interpolate
@@ -42,12 +42,14 @@ class Pass:
     g_odom: F64 = field(default_factory=lambda: np.zeros(3))
 
 
-def process(path: Path, truth_path: Path, params: Params) -> Pass:
+def process(
+    path: Path, truth_path: Path, params: Params, start_s: float = 0.0, duration_s: float | None = None
+) -> Pass:
     truth, engine = read_tum(truth_path), Engine(params)
     stamps, poses = [], []
     outcome = Pass(truth, truth)
     with open_recording(path, params) as recording:
-        for entry in recording.measurements():
+        for entry in recording.measurements(start_s, duration_s):
             if not isinstance(entry, Measurement):
                 continue
             r = engine.step(entry.scan, entry.imu)
@@ -75,12 +77,17 @@ def process(path: Path, truth_path: Path, params: Params) -> Pass:
 
 @pytest.fixture(scope="session")
 def passed(shared_data: Path) -> Callable[[str], Pass]:
-    """The outcome of "hall", "outdoor", "garage" or "mid360"."""
+    """The outcome of "hall", "outdoor", "garage", "mid360" or "amid the sample"."""
 
     @cache
     def outcome(name: str) -> Pass:
         if name == "garage":
             return process(shared_data / "garage_hdl32e.mcap", shared_data / "garage_hdl32e_reference.tum", Params())
+        if name == "amid the sample":
+            sample = Path(__file__).resolve().parents[2] / "sample_data" / "cloister.mcap"
+            return process(
+                sample, sample.with_name("cloister_truth.tum"), resolve_params(sample, None, None, []), 10.0, 14.0
+            )
         if name == "mid360":
             mid360 = Params().merged(PRESETS["mid360"])
             return process(shared_data / "hall_mid360.mcap", shared_data / "hall_mid360_truth.tum", mid360)
