@@ -1,5 +1,6 @@
 """Damaged recordings of every format, run as a user runs them."""
 
+import gc
 import io
 import math
 import os
@@ -23,10 +24,12 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import app.calibration.calibrate
 import app.evaluation.truth
 import app.export.exports
 import app.mapping.opening
 import app.slam.doubts  # noqa: F401
+from app.__main__ import main
 from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.live.feed import packets_of
 from app.sensors.live.livox_udp import SLOT_NS, LivoxWriter, write_imu
@@ -94,6 +97,7 @@ class Recordings:
             self._sent(self._path / "airy.mcap", AIRY),
         ]
         self._files: dict[str, bytes] = {}
+        gc.freeze()  # else each fork looks for garbage in all that is here, and so copies it
         code, said, _, _ = self._run(self.good)
         assert code == 0, said
         self.said = {*SAYS_SO.findall(said)}
@@ -208,8 +212,6 @@ class Recordings:
 
 def _become_hemislam(arguments: list[str], said: int) -> None:
     """In a child process: run the command line and end."""
-    from app.__main__ import main
-
     for stream in (1, 2):
         os.dup2(said, stream)
     sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(stream, "wb", 0), write_through=True) for stream in (1, 2))
