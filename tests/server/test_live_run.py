@@ -189,7 +189,7 @@ def test_what_a_robot_sends_gives_the_same_walk_as_the_file(live: Live, from_fil
 def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_map(
     live: Live, from_file: dict[int, np.ndarray]
 ) -> None:
-    thread = live.play(1.0)
+    thread = live.play(4.0)
     live.until(lambda s: s.transport.frame >= 25)
     live.engine.send(AddNote("a door"))
     before = live.until(lambda s: bool(s.notes))
