@@ -31,7 +31,6 @@ from app.slam.types import (
     ImuSamples,
     Keyframe,
     NavState,
-    Registration,
     Scan,
     StepResult,
 )
@@ -206,7 +205,7 @@ class Engine:
             points_filter=len(sampled.points),
             timings_ms=watch.laps(),
             keyframe=keyframe,
-            notices=_notices(begun, before.status, status, fused.registration),
+            notices=_notices(begun, before.status, status, fused, before.bent),
             truth_ground=scan.truth_ground,
             imu_gap_s=imu.longest_gap(samples, end_ns),
             clock_late_s=clock.late,
@@ -339,11 +338,15 @@ class Engine:
         return keyframe
 
 
-def _notices(begun: _Begun, last: FrameStatus, status: FrameStatus, registration: Registration) -> tuple[str, ...]:
-    begun_by = (begun.notice,) if begun.notice else ()
-    if status is last or FrameStatus.LOST not in (status, last):
-        return begun_by
-    return (*begun_by, f"Lost: {registration.reason}." if status is FrameStatus.LOST else "Tracking again.")
+def _notices(begun: _Begun, last: FrameStatus, status: FrameStatus, fused: Fused, bent: bool) -> tuple[str, ...]:
+    """For the user. bent: as in `EngineProgress`, before this frame."""
+    notices = [begun.notice] if begun.notice else []
+    if bent and not (begun.waiting or begun.paused or fused.bent or fused.anew):
+        notices.append(start.GUESSED)
+    if status is not last and FrameStatus.LOST in (status, last):
+        lost = status is FrameStatus.LOST
+        notices.append(f"Lost: {fused.registration.reason}." if lost else "Tracking again.")
+    return tuple(notices)
 
 
 def _down_in_lidar(state: NavState) -> F64:

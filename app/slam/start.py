@@ -36,6 +36,10 @@ RIDDEN = 0.2, 0.05
 sensors they see it within 0.1 and 0.03."""
 SURE = 5.0
 """Standard deviations by which it must have moved: scans may leave a direction open, as along a corridor."""
+GUESSED = (
+    "The first scans do not show the speed in every direction. If the map is off near its beginning, begin at rest or "
+    "some seconds earlier or later."
+)
 RIDING = "The device was moving evenly at the start: biases and gravity begin as rough guesses."
 
 

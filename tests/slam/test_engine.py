@@ -115,6 +115,7 @@ def test_a_start_in_motion_knows_its_speed_by_the_second_scan_and_soon_what_is_d
     """The first scan is bent by 12 cm, at a speed that nothing tells; it stays out of the map and of the keyframes."""
     walk = replace(ALONG, still=-4.0)
     results = run(Engine(params_for(REAL)), measurements(corridor(16.0, pillars=True), walk, REAL, 30))
+    assert [n for r in results for n in r.notices] == list(results[0].notices)
     assert "moving" in results[0].notices[0]
     assert next(r.index for r in results if r.keyframe) == 1
     for k, result in enumerate(results[1:], 1):
@@ -124,6 +125,14 @@ def test_a_start_in_motion_knows_its_speed_by_the_second_scan_and_soon_what_is_d
         down = state.R_odom_imu.T @ state.g_odom / GRAVITY @ (to_imu @ [0.0, 0.0, -1.0])
         assert k < 10 or np.degrees(np.arccos(min(down, 1.0))) < 1.0
     assert worst(results, walk)[0] < 0.02
+
+
+def test_a_start_in_motion_says_where_the_speed_is_a_guess() -> None:
+    """Nothing tells how fast the walk goes along a bare corridor."""
+    bare = measurements(corridor(150.0, pillars=False), replace(ALONG, still=-4.0), REAL, 6)
+    results = run(Engine(params_for(REAL)), bare)
+    assert ["do not show the speed" in " ".join(r.notices) for r in results] == [False, True] + 4 * [False]
+    assert next(r.index for r in results if r.keyframe) == 1
 
 
 @pytest.mark.parametrize("yaw_rate", [0.0, 0.1])
