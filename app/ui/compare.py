@@ -145,7 +145,7 @@ class ComparePanel:
         with self._comparison:
             self._add_comparison(gui)
         self._what.on_click(by_user(self._act))
-        add_command(gui, "Swap A and its fork B", lambda _: forks.swap(), hotkey="X")
+        add_command(gui, "Swap A and its fork B", lambda _: self._swap(), hotkey="X")
 
     def _add_comparison(self, gui: viser.GuiApi) -> None:
         gui.add_html(maths.legend())
@@ -230,12 +230,16 @@ class ComparePanel:
     def _act(self, what: Any, client: viser.ClientHandle) -> None:
         match what:
             case "swap":
-                self._forks.swap()
+                self._swap()
             case "keep":
                 path = self._forks.keep(self._name.value)
                 client.add_notification("Kept", f"The fork is saved as {path}; hemislam serve opens it.")
             case "discard":
                 self._forks.discard()
+
+    def _swap(self) -> None:
+        self._forks.swap()
+        show(self._name, self._forks.names[1])  # B is what `keep` keeps
 
     def _begin(self) -> None:
         self._forks.fork(self._name.value)

@@ -242,6 +242,11 @@ class ParameterPanel:
                 self._add_reset(section)
         gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
 
+    def follow(self, a: Snapshot) -> None:
+        """Take in what A has open: `reset` leads back to the values it had then, in a fork as well."""
+        if (recording := a.recording.path.resolve() if a.recording else None) != self._recording:
+            self._recording, self._opened = recording, a.params
+
     def draw(self, snapshot: Snapshot, tuning: bool = False) -> None:
         """Bring the controls up to a snapshot. tuning: whether its scan shows what the ground sliders do."""
         now = self._now()
@@ -268,8 +273,6 @@ class ParameterPanel:
             names = self._history.change(by)
             button.disabled = not names
             button.label = f"{verb} {', '.join(self._names[name] for name in list(names)[:2])}".strip()
-        if (recording := snapshot.recording.path if snapshot.recording else None) != self._recording:
-            self._recording, self._opened = recording, snapshot.params
         if self._resets_due(snapshot.params, self._opened):
             self._show_resets(snapshot.params)
         self._show_ground(snapshot, tuning)

@@ -192,6 +192,7 @@ class Workbench:
         self._compare.draw(current, view)
         view = self._clip.seen(current, self._map_compare.seen(current, self._compare.seen(view)))
         view = self._draw_scene(current, view)
+        self._parameters.follow(current)
         self._parameters.draw(self._sides.tuned(current), view.tuning)
         self._loops.draw(current, view)
         self._study.draw(current, view)

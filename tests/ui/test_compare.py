@@ -268,6 +268,7 @@ def test_while_b_lags_the_newest_frame_that_both_have_is_shown(page: Page, serve
 
 
 def test_swapped_b_is_drawn_whole_and_a_follows(page: Page) -> None:
+    user_sets(page.panel._name, "wide")
     page.forks.fork("wide", {"ground.sigma": 0.15})
     page.engine.send(Seek(40))
     page.both_at(40)
@@ -279,6 +280,7 @@ def test_swapped_b_is_drawn_whole_and_a_follows(page: Page) -> None:
     np.testing.assert_allclose(path, page.forks.snapshot.trajectory, rtol=0, atol=1e-3)
     page.forks.send(StepFrame(1))
     eventually(lambda: page.engine.snapshot.transport.frame == 41)
+    assert "hall_bpearl-main.hemislam" in chooses(page.panel._what, "keep").told[0]
 
 
 def test_keep_says_where_the_file_is_and_errors_are_shown(page: Page, tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """The parameter panel: what a person sets becomes a command, what the engine says is shown, and neither echoes."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -37,7 +39,9 @@ class Parameters:
 
     def tick(self, seconds: float = 0.0, **changes: Any) -> None:
         self.clock.now += seconds
-        self.panel.draw(Snapshot(params=self.params, **changes))
+        snapshot = Snapshot(params=self.params, **changes)
+        self.panel.follow(snapshot)
+        self.panel.draw(snapshot)
 
 
 @pytest.fixture
@@ -179,6 +183,19 @@ def test_changed_parameters_can_be_reset_one_by_one_or_all(parameters: Parameter
     (command,) = parameters.sent
     assert isinstance(command, SetParams)
     assert command.values == {path: opened.value(path) for path in PRIMARY}
+
+
+def test_resets_lead_back_to_the_opening_after_a_fork_has_been_swapped_for_a(
+    parameters: Parameters, engine: FakeEngine
+) -> None:
+    """A fork has nothing open while it starts, and then the recording by its full path."""
+    resets, recording = parameters.panel._resets["primary"], engine.snapshot.recording
+    assert recording is not None
+    parameters.tick(recording=replace(recording, path=Path(os.path.relpath(recording.path))))
+    parameters.panel.draw(Snapshot(params=parameters.params))
+    parameters.params = Params().with_values({"ground.alpha": 12.0})
+    parameters.tick(recording=recording)
+    assert resets.options == ("α seed angle",)
 
 
 def test_what_the_ground_sliders_made_of_the_scan_stands_below_them(parameters: Parameters, engine: FakeEngine) -> None:
