@@ -159,13 +159,12 @@ class Engine:
             fused = fuse(prediction, scan, points, sampled.points, source, self._map, p, alike)
         mapped = fused if begun.ride is None else self._followed(begun.ride, scan, samples, clock.sigma)
         if mapped.anew:
-            mapped = replace(mapped, belief=imu.at_map_begin(mapped.belief, p.filter.estimate_extrinsics))
             self._map.clear()
         status = FrameStatus.LOST if fused.lost else FrameStatus.TRACKING
         status = FrameStatus.INITIALISING if begun.waiting else status
         watch.lap("update")
 
-        posterior, paused = fused.belief if begun.waiting else mapped.belief, begun.paused
+        posterior, paused = fused.belief, begun.paused
         believed = prediction.covered and not (fused.imu_wrong or fused.anew)
         if status is FrameStatus.TRACKING and fused.registration.inliers and believed:
             if p.imu.learn_clock:

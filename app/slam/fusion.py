@@ -43,7 +43,7 @@ class Fused:
     lost: whether the pose is a guess: the scan met too few planes, or nothing measures the speed any more.
     imu_wrong: whether the scan shows that the IMU was wrong about how the device moved during it.
     bent: whether the points were deskewed at an unknown speed and begin the map.
-    anew: whether the map, which held such points, begins anew with these.
+    anew: whether the map, which held such points, is to begin anew with these.
     """
 
     belief: Belief
@@ -135,7 +135,8 @@ def _straight(
     if np.linalg.eigvalsh(posterior.covariance[VEL, VEL])[-1] > TOLD**2:
         return None
     points = coast.deskew(scan, posterior.state, Course.measured(alike.path, alike.belief.state))
-    return Fused(posterior, registration, points, points[source], anew=True)
+    at_begin = imu.at_map_begin(posterior, params.filter.estimate_extrinsics)
+    return Fused(at_begin, registration, points, points[source], anew=True)
 
 
 def _better(fused: Fused, even: Prediction, scan: Scan, source: I32, local_map: LocalMap, params: Params) -> Fused:
