@@ -165,13 +165,18 @@ class ParameterHistory:
     def __init__(self) -> None:
         self._states: list[Params] = []
         self._at = -1
+        self._left: list[Params] = []  # by undo and redo, of which the engine may not have heard yet
         self._changed: set[str] = set()  # paths, last
         self._changed_at = -_DRAG_S
 
     def see(self, params: Params, now: float) -> None:
         """Take in the present parameters, wherever a change came from."""
         if self._at >= 0 and params == self._states[self._at]:
+            self._left.clear()
             return
+        if params in self._left:
+            return
+        self._left.clear()
         changed = set(self._states[self._at].changed(params)) if self._states else set()
         merged = self._at > 0 and changed == self._changed and now - self._changed_at < _DRAG_S
         del self._states[self._at + (0 if merged else 1) :]
@@ -189,6 +194,7 @@ class ParameterHistory:
         return self._states[self._at].changed(self._states[self._at + by])
 
     def go(self, by: int) -> None:
+        self._left.append(self._states[self._at])
         self._at += by
         self.settle()
 

@@ -265,6 +265,23 @@ def test_a_value_set_in_a_browser_is_sent_although_an_older_snapshot_is_drawn_me
     assert parameters.control("ground.alpha").value == 33.0
 
 
+def test_what_is_undone_can_be_redone_although_an_older_snapshot_is_drawn_meanwhile(parameters: Parameters) -> None:
+    changed = Params().with_values({"ground.sigma": 0.1})
+    parameters.tick()
+    parameters.params = changed
+    parameters.tick(10.0)
+    user_clicks(parameters.panel._undo)
+    parameters.tick(0.04)  # the engine is still at a frame
+    parameters.params = Params()
+    parameters.tick(0.04)
+    assert parameters.panel._undo.disabled and parameters.panel._redo.label == "Redo σ thickness"
+    user_clicks(parameters.panel._redo)
+    parameters.tick(0.04)
+    parameters.params = changed
+    parameters.tick(0.04)
+    assert parameters.panel._redo.disabled and parameters.panel._undo.label == "Undo σ thickness"
+
+
 def test_a_slow_drag_is_undone_at_once() -> None:
     history = ParameterHistory()
     history.see(Params(), 0.0)
