@@ -145,7 +145,7 @@ class PicturesPanel:
 
     def _take(self, client: viser.ClientHandle, stations: list[Station], file: Path) -> None:
         """Write the pictures one after the other. If it is stopped, nothing is left."""
-        part, (key, light) = file.with_suffix(".part"), self._key()
+        part, (key, light), session = file.with_suffix(".part"), self._key(), self._page.snapshot().session
         try:
             with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as pictures:
                 for number, station in enumerate(stations, 1):
@@ -153,6 +153,8 @@ class PicturesPanel:
                     rendered = self._rendered(client, here)
                     if self._stopped.is_set():
                         return
+                    if self._page.snapshot().session != session:
+                        raise HemislamError("The map is another one now, so the flight has ended; start it again.")
                     pictures.writestr(f"{number:05d}.png", self._png(rendered, key, light))
                     self._share = number / len(stations)
             part.replace(file)

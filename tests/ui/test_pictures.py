@@ -3,6 +3,7 @@
 import io
 import itertools
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -170,6 +171,20 @@ def test_a_flight_that_is_stopped_leaves_nothing(bench: Bench, tmp_path: Path) -
     bench.do(bench.panel._fly)
     assert list((tmp_path / "flights").iterdir()) == [] and not bench.panel._download.visible
     assert bench.browser.told == []
+
+
+def test_a_flight_ends_where_another_recording_is_opened_and_that_is_said(bench: Bench, tmp_path: Path) -> None:
+    panel, render, now = bench.panel, bench.browser.get_render, [WALKED]
+    panel._page = replace(panel._page, snapshot=lambda: now[0])
+
+    def then_open(*args: Any, **asked: Any) -> np.ndarray:
+        now[0] = replace(WALKED, session=WALKED.session + 1)
+        return render(*args, **asked)
+
+    bench.browser.get_render = then_open  # type: ignore[method-assign]
+    bench.do(panel._fly)
+    assert list((tmp_path / "flights").iterdir()) == [] and not panel._download.visible
+    assert len(bench.browser.asked) == 1 and "the flight has ended" in bench.browser.told[0]
 
 
 @pytest.mark.parametrize(
