@@ -100,9 +100,12 @@ if (!window.hemislamSay) {
 
   // Keys. On its way up an event passes widgets (the page's root), the body, viser's hotkeys (the html element) and
   // viser's camera (the document). Left and right move a focused slider or tab, else step a frame, never the camera.
+  // Another key that is held counts once. Behind a dialog no key counts.
   const sideways = (event) => event.key === 'ArrowLeft' || event.key === 'ArrowRight';
   document.body.addEventListener('keydown', (event) => {
-    if (sideways(event) && event.target.closest('[role=slider],[role=tab]')) event.stopPropagation();
+    if (event.key === 'Escape' || event.key === 'Tab') return;
+    const taken = sideways(event) ? event.target.closest('[role=slider],[role=tab]') : event.repeat;
+    if (taken || document.querySelector('.mantine-Modal-body')) event.stopPropagation();
   });
   document.documentElement.addEventListener('keydown', (event) => {
     if (!sideways(event)) return;

@@ -1,0 +1,47 @@
+"""Keys of the page in a real Chromium: held ones, and those pressed while a dialog is open.
+
+Tests app/ui/viser_adapter.py.
+"""
+
+import pytest
+from playwright.sync_api import expect
+
+from app.server.protocol import Play, StepFrame
+from tests.browser.conftest import Bench
+
+
+@pytest.fixture(autouse=True)
+def _fresh(bench: Bench) -> None:
+    bench.engine.sent.clear()
+
+
+def test_a_key_that_is_held_counts_once_but_an_arrow_goes_on(bench: Bench) -> None:
+    keyboard = bench.page.keyboard
+    for _ in range(4):
+        keyboard.down("Space")  # the browser repeats it
+    keyboard.up("Space")
+    bench.page.wait_for_timeout(500)
+    assert [type(command) for command in bench.engine.sent] == [Play]
+    bench.press("Space", lambda: not bench.engine.snapshot.transport.playing)
+    bench.engine.sent.clear()
+    for _ in range(4):
+        keyboard.down("ArrowRight")
+        bench.page.wait_for_timeout(200)
+    keyboard.up("ArrowRight")
+    bench.eventually(lambda: bench.engine.sent.count(StepFrame()) > 1)
+
+
+def test_behind_a_dialog_keys_do_nothing(bench: Bench) -> None:
+    bench.page.get_by_role("tab", name="Parameters").click()
+    bench.page.get_by_role("button", name="Load YAML").click()
+    cancel = bench.page.get_by_role("button", name="Cancel")
+    expect(cancel).to_be_visible()
+    colours = bench.workbench._appearance.view.colour_by
+    for key in ("Space", "ArrowRight", "c"):
+        cancel.focus()
+        bench.page.keyboard.press(key)
+    bench.page.wait_for_timeout(500)
+    assert not bench.engine.sent and bench.workbench._appearance.view.colour_by == colours
+    bench.page.keyboard.press("Escape")
+    expect(cancel).to_have_count(0)
+    bench.press("ArrowRight", lambda: StepFrame() in bench.engine.sent)
