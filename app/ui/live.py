@@ -6,9 +6,10 @@ from typing import Final
 import viser
 
 from app.sensors.live.status import Counters, LiveState
-from app.server.protocol import Snapshot
+from app.server.protocol import LIVE, OpenRecording, Play, Snapshot
 from app.ui.files import size_text
 from app.ui.html import BAD, GOOD, QUIET, WARN, Tile, number, panel
+from app.ui.widgets import Page, add_button
 
 OLD_S: Final = 0.5
 SILENT_S: Final = 2.0
@@ -97,12 +98,29 @@ def _age(age_s: float) -> str:
 
 
 class LivePanel:
-    """The panel in the caller's container; hidden while a recording is open."""
+    """The panel in the caller's container; while a recording is open, the way back to the source, if there is one."""
 
-    def __init__(self, gui: viser.GuiApi) -> None:
-        self._html = gui.add_html("", visible=False)
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._html = page.gui.add_html("", visible=False)
+        hint = "Maps what the sensor sends from now on, in a new map. What --record writes has no gap."
+        self._back = add_button(
+            page.gui,
+            "Back to the live source",
+            lambda _: self._open_source(),
+            viser.Icon.BROADCAST,
+            visible=False,
+            hint=hint,
+        )
+        self._was_live = False
+
+    def _open_source(self) -> None:
+        self._page.send(OpenRecording(LIVE))
+        self._page.send(Play())
 
     def draw(self, snapshot: Snapshot) -> None:
+        self._was_live |= snapshot.live is not None
         self._html.visible = snapshot.live is not None
+        self._back.visible = self._was_live and snapshot.live is None and snapshot.progress is None
         if snapshot.live is not None:
             self._html.content = live_html(snapshot.live, ended=snapshot.transport.finished)

@@ -137,7 +137,7 @@ class Workbench:
                 self._map_compare = MapComparePanel(page, folders, results, self._appearance.colour_by)
         with tabs.add_tab("Recording", viser.Icon.FILE_DATABASE):
             files.add_buttons()
-            self._live = LivePanel(gui)
+            self._live = LivePanel(page)
             self._doctor = DoctorPanel(page)
             with gui.add_folder("Calibration", expand_by_default=False):
                 self._calibration = CalibrationPanel(page, unasked=calibrate, resolve=resolve)

@@ -22,7 +22,7 @@ from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from app.server.keeping import AddNote
-from app.server.protocol import LIVE, OpenRecording, Pause, Seek, Snapshot, StepFrame
+from app.server.protocol import LIVE, OpenRecording, Pause, Play, Seek, Snapshot, StepFrame
 from app.server.setup import Setup
 from app.server.worker import EngineProcess
 from app.slam.loops.service import InlineLoops
@@ -246,6 +246,12 @@ def test_a_recording_that_is_opened_after_a_live_session_is_not_live(live: Live)
     live.engine.send(OpenRecording(SAMPLE, None))
     opened = live.until(lambda now: now.recording is not None and now.recording.path == SAMPLE)
     assert opened.live is None, "the page would offer no timeline, no truth and no search for parameters"
+    for command in (OpenRecording(LIVE), Play()):  # as the page's way back
+        live.engine.send(command)
+    live.until(lambda now: now.live is not None and now.transport.playing and now.progress is None)
+    live.play(4.0)
+    mapped = live.until(lambda now: now.transport.frame >= 10)
+    assert mapped.session > opened.session and mapped.recording is not None and mapped.recording.path == LIVE
 
 
 def test_paused_the_source_is_still_watched_and_its_end_is_said_and_survived(live: Live) -> None:

@@ -11,10 +11,11 @@ import pytest
 import viser
 
 from app.sensors.live.status import Counters, LiveState
+from app.server.protocol import LIVE, Command, OpenRecording, Play
 from app.ui.html import BAD, GOOD, WARN
 from app.ui.live import LivePanel, live_html, verdict
 from app.ui.transport import TransportPanel, state
-from tests.ui.conftest import Clock, Wire, page_of
+from tests.ui.conftest import Clock, Wire, page_of, user_clicks
 from tests.ui.fake_engine import FakeEngine
 
 WELL = LiveState(
@@ -86,7 +87,7 @@ def test_a_sensor_s_words_are_no_html() -> None:
 
 
 def test_the_panel_takes_no_place_while_a_recording_is_open(server: viser.ViserServer, engine: FakeEngine) -> None:
-    panel = LivePanel(server.gui)
+    panel = LivePanel(page_of(server))
     panel.draw(engine.snapshot)
     assert not panel._html.visible
     panel.draw(replace(engine.snapshot, live=WELL))
@@ -95,8 +96,21 @@ def test_the_panel_takes_no_place_while_a_recording_is_open(server: viser.ViserS
     assert not panel._html.visible
 
 
+def test_from_a_recording_there_is_a_way_back_to_the_live_source(server: viser.ViserServer, engine: FakeEngine) -> None:
+    sent: list[Command] = []
+    panel, recorded = LivePanel(page_of(server, sent.append)), engine.snapshot
+    panel.draw(recorded)
+    assert not panel._back.visible, "there is no source"
+    panel.draw(replace(recorded, live=WELL))
+    assert not panel._back.visible
+    panel.draw(recorded)
+    assert panel._back.visible
+    user_clicks(panel._back)
+    assert sent == [OpenRecording(LIVE), Play()]
+
+
 def test_nothing_is_sent_while_nothing_changes(server: viser.ViserServer, engine: FakeEngine, wire: Wire) -> None:
-    panel = LivePanel(server.gui)
+    panel = LivePanel(page_of(server))
     live = replace(engine.snapshot, live=WELL)
     panel.draw(live)
     wire.clear()
@@ -116,7 +130,7 @@ def test_a_live_session_cannot_go_back_and_the_page_says_why(server: viser.Viser
 
 
 def test_the_panel_shows_the_end_although_no_new_reading_came(server: viser.ViserServer, engine: FakeEngine) -> None:
-    panel = LivePanel(server.gui)
+    panel = LivePanel(page_of(server))
     engine.publish(live=WELL)
     panel.draw(engine.snapshot)
     assert "receiving" in panel._html.content
