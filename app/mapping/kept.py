@@ -25,10 +25,16 @@ KeptView = tuple[Vector, Vector]
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """A place on what a keyframe saw, so that it moves with the map. at: (x, y, z), m, in the keyframe's IMU frame."""
+    """A place on what a keyframe saw, so that it moves with the map.
+
+    Attributes:
+        at: (x, y, z), m, in the keyframe's IMU frame. frame: of the keyframe, since other settings make others; -1: not
+            known, as in older files.
+    """
 
     keyframe: int
     at: Vector
+    frame: int = -1
 
 
 @dataclass(frozen=True, slots=True)

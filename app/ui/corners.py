@@ -1,5 +1,6 @@
 """The corner, edge or surface that a click near it means: where the planes around it meet."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -33,7 +34,7 @@ def snapped(chunks: tuple[Chunk, ...], poses: F64, spot: Spot) -> Spot:
     T = poses[spot.keyframe]
     at = lie.moved(T, spot.at)
     x, y, z = (T[:3, :3].T @ (at + meeting(around(chunks, poses, at, _AROUND_M) - at) - T[:3, 3])).tolist()
-    return Spot(spot.keyframe, (x, y, z))
+    return replace(spot, at=(x, y, z))
 
 
 def meeting(points: F64) -> F64:

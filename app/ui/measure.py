@@ -86,8 +86,9 @@ class MeasurePanel:
                 spot = snapped(current.chunks, poses, spot)
             if spot is not None and self._kind == kind:  # meanwhile the user may have chosen another
                 self._take(kind, spot, current)
-        kept = [(measure, places(measure, poses)) for measure in current.measures]
-        begun = places(Measure("", self._spots), poses) if self._spots else None
+        frames = {chunk.index: chunk.frame for chunk in current.chunks} if current.measures or self._spots else {}
+        kept = [(measure, places(measure, poses, frames)) for measure in current.measures]
+        begun = places(Measure("", self._spots), poses, frames) if self._spots else None
         where = [(measure, at) for measure, at in kept if at is not None]
         drawn = str([at.round(3).tolist() for _, at in where])
         self._where = current.earth.found.reference if current.earth.found is not None else None
@@ -138,7 +139,7 @@ class MeasurePanel:
             self._nodes.append(scene.add_label(f"{ROOT}/measures/begun/{number}", f"{number + 1}", position=place))
 
     def _draw_list(self, later: int, map_shown: bool) -> None:
-        """later: how many measures are on a part of the walk that is not here yet."""
+        """later: how many measures are on keyframes that are not here, as after going back or with other settings."""
         left = _SPOTS.get(self._kind, 0) - len(self._spots)
         self._kinds.options = (
             *(_CHOSEN + kind if kind == self._kind else kind for kind in _SPOTS),
@@ -150,7 +151,7 @@ class MeasurePanel:
             asked = "The map is hidden; show it to click its points."
         self._asked.content, self._asked.visible = panel("text", asked), bool(asked)
         rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]
-        waiting = f"{later} more on a part of the walk that is not here at this frame." if later else ""
+        waiting = f"{later} more on keyframes that the map does not hold now." if later else ""
         self._list.content = self._bridge.live(panel("measures", rows, waiting)) if rows or later else ""
         self._list.visible, self._save.visible = bool(rows or later), bool(rows)
 

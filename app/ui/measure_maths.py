@@ -1,6 +1,8 @@
 """Measures in the map: the point that a click meets, coordinates, distances, heights, angles; as words and as CSV."""
 
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -85,17 +87,19 @@ def meet(
     which = int(np.argmin([one.min(initial=np.inf) for one in best]))
     chunk, points = found[which][2:]
     x, y, z = lie.moved(chunk.T_imu_lidar, points[np.argmin(best[which])]).tolist()
-    return Spot(chunk.index, (x, y, z))
+    return Spot(chunk.index, (x, y, z), chunk.frame)
 
 
-def places(measure: Measure, poses: F64) -> F64 | None:
-    """(1 to 3, 3) m, its spots in the map; None where a keyframe is not there, as after going back.
+def places(measure: Measure, poses: F64, frames: Mapping[int, int] = MappingProxyType({})) -> F64 | None:
+    """(1 to 3, 3) m, its spots in the map; None where a keyframe is not there, as after going back, or is another one.
 
     Args:
-        poses: (k, 4, 4) T_map_imu of the keyframes.
+        poses: (k, 4, 4) T_map_imu of the keyframes. frames: of keyframes, by their index.
     """
-    if any(not 0 <= spot.keyframe < len(poses) for spot in measure.spots):
-        return None
+    for spot in measure.spots:
+        other = spot.frame not in (-1, frames.get(spot.keyframe, spot.frame))
+        if other or not 0 <= spot.keyframe < len(poses):
+            return None
     return np.array([lie.moved(poses[spot.keyframe], spot.at) for spot in measure.spots])
 
 

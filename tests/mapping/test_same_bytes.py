@@ -9,13 +9,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.mapping.checkpoints import DEFAULT_BYTES
+from app.mapping.kept import Kept, Measure, Spot
 from app.mapping.opening import open_session
+from app.mapping.saving import mark
 from app.mapping.session import Session
 from app.mapping.session_file import SUFFIX, read_session, write_session
 from app.sensors.presets import resolve_params
@@ -210,3 +214,11 @@ def test_the_file_of_what_was_done_in_the_page_repeats_it_headless(
     printed = call(tmp_path / "headless", "run", str(recording), *SHORT, "--loops", str(path))
     assert "Accept 1-2 has no effect" in printed
     assert read(tmp_path / "headless") == ours
+
+
+def test_what_was_measured_on_keyframes_of_other_settings_is_not_saved() -> None:
+    at = (0.5, 0.25, -1.0)
+    spots = {"here": Spot(1, at, 49), "other": Spot(1, at, 45), "older file": Spot(0, at), "later": Spot(2, at, 84)}
+    results: Any = SimpleNamespace(keyframes=[SimpleNamespace(frame=0), SimpleNamespace(frame=49)])
+    mark(results, Kept(measures=tuple(Measure(name, (spot,)) for name, spot in spots.items())))
+    assert results.marks == (("here", ((1, at),)), ("older file", ((0, at),)))

@@ -94,7 +94,7 @@ def test_a_recording_has_a_session_file_however_long_its_name_is(tmp_path: Path)
 
 VIEW = ((1.0, 2.0, 30.5), (0.0, 0.0, 0.0))
 CLIP = Clip(Box((-1.0, -2.0, 0.25), (3.0, 2.0, 2.5), 30.0), on=True, slab=0.5)
-DOOR = Measure("door", (Spot(1, (0.5, 0.25, -1.0)), Spot(2, (0.5, 0.25, 1.125))))
+DOOR = Measure("door", (Spot(1, (0.5, 0.25, -1.0)), Spot(2, (0.5, 0.25, 1.125), 7)))
 
 TURNED = "The LiDAR seems to be rotated by 90°, 0°, 0° on the IMU."
 

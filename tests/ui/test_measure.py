@@ -93,6 +93,13 @@ def test_a_measure_moves_with_the_map_and_waits_for_its_keyframe() -> None:
     assert places(wall, POSES[:2]) is None
 
 
+def test_a_measure_is_not_put_on_another_keyframe_that_other_settings_made() -> None:
+    wall = Measure("wall", (Spot(1, (0.0, 0.0, 0.0), 45),))
+    assert places(wall, POSES, {0: 0, 1: 45}) is not None
+    assert places(wall, POSES, {0: 0, 1: 49}) is None, "it would be somewhere else"
+    assert places(replace(wall, spots=(Spot(1, (0.0, 0.0, 0.0)),)), POSES, {1: 49}) is not None, "of an older file"
+
+
 def test_the_csv_has_a_row_for_each_spot() -> None:
     at = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]])
     door = Measure("door, left", (spot_at(at[0]), spot_at(at[1])))
@@ -224,7 +231,7 @@ def test_a_measure_of_what_is_not_here_yet_is_still_counted(server: viser.ViserS
     bench.keep()
     bench.now = replace(bench.now, chunks=(), keyframe_poses=POSES[:0])
     bench.panel.draw(bench.now, View())
-    assert bench.panel._list.visible and "1 more on a part of the walk" in bench.panel._list.content
+    assert bench.panel._list.visible and "1 more on keyframes" in bench.panel._list.content
 
 
 def test_a_click_that_is_met_while_stop_is_pressed_is_dropped(
