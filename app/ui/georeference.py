@@ -151,7 +151,8 @@ class GeoreferencePanel:
         self._choose.visible, self._table.visible = by == FILE, by == CONTROL
         self._use.visible = self._lever.visible = self._offset.visible = by in (RECORDED, FILE)
         self._crs.visible = self._height.visible = by != NOTHING
-        self._lay.label = "Leave the map where it is" if by == NOTHING else "Georeference the map"
+        self._lay.label = "Stop georeferencing" if by == NOTHING else "Georeference the map"
+        self._lay.visible = by != NOTHING or self._shown is not None
         self._name.visible = self._fit.visible = self._pick.visible = bool(names)
         self._radius.visible = bool(names) and self._fit.value == _SPHERE
         if names and self._name.options != names:

@@ -108,6 +108,16 @@ def test_the_widgets_say_what_the_map_is_georeferenced_by(paging: Paging, tmp_pa
     assert paging.lay() == Survey(control=TABLE, crs="EPSG:25832")
 
 
+def test_there_is_nothing_to_stop_where_nothing_is_georeferenced(paging: Paging) -> None:
+    paging.show(Snapshot())
+    assert not paging.panel._lay.visible
+    choose(paging.panel._by, RECORDED)
+    assert paging.panel._lay.visible and paging.panel._lay.label == "Georeference the map"
+    paging.show(LAID)
+    choose(paging.panel._by, NOTHING)
+    assert paging.panel._lay.visible and paging.panel._lay.label == "Stop georeferencing"
+
+
 @pytest.mark.parametrize("text", ["0.1 0.2", "a b c", "nan 0 0"])
 def test_a_malformed_lever_arm_is_reported(text: str) -> None:
     with pytest.raises(HemislamError, match=r"The lever arm is .* it takes 3 numbers, or nothing"):
