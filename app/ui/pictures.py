@@ -47,14 +47,14 @@ class PicturesPanel:
         self._stopped = threading.Event()
         self._share, self._saved = 0.0, Path()
         self._changes = Changes()
-        self._width = limited(gui.add_number("width", 1920, min=64, max=_LARGEST, step=1, hint="Pixels."))
-        self._height = limited(gui.add_number("height", 1080, min=64, max=_LARGEST, step=1, hint="Pixels."))
+        self._width = limited(gui.add_number("width (px)", 1920, min=64, max=_LARGEST, step=1))
+        self._height = limited(gui.add_number("height (px)", 1080, min=64, max=_LARGEST, step=1))
         self._explain = gui.add_checkbox("with legend and scale", True)
         shoot = partial(self._reporting, act=self._shoot)
         add_button(gui, "Take a picture", shoot, viser.Icon.CAMERA, hint="A PNG of this view.")
         self._way = gui.add_dropdown("fly with", tuple(_WAYS))
         self._seconds = limited(
-            gui.add_number("seconds", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures each.")
+            gui.add_number("length (s)", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures a second.")
         )
         hint = "Numbered PNGs in a zip file, in this size. Keep this tab in front."
         fly = partial(self._reporting, act=self._fly)

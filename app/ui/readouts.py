@@ -79,7 +79,7 @@ def times_html(snapshot: Snapshot, result: StepResult) -> str:
         Tile("frame", number(took.get("total", np.nan), 1), "ms"),
         Tile("dropped", f"{snapshot.transport.dropped:,}", "scans"),
     ]
-    stages = [(STAGE_COLOURS[stage], f"{stage} {number(took.get(stage, np.nan), 1)}") for stage in STAGES]
+    stages = [(STAGE_COLOURS[stage], f"{stage} {number(took.get(stage, np.nan), 1)} ms") for stage in STAGES]
     return panel("times", tiles, stages)
 
 

@@ -23,13 +23,14 @@ from app.server.protocol import (
 )
 from app.slam.errors import HemislamError
 from app.slam.params import Params
+from app.slam.types import STAGES
 from app.ui import hints
 from app.ui.colours import LABEL, Limits, legend
 from app.ui.files import _FORMATS, folder_name, result_folder_name, size_text
 from app.ui.hints import HINTS
 from app.ui.html import BAD, GOOD, WARN, Tile, panel, source
 from app.ui.loops.words import KINDS, LoopKind
-from app.ui.readouts import HISTORY, filter_tiles, plotted, stacked_stages
+from app.ui.readouts import HISTORY, filter_tiles, plotted, stacked_stages, times_html
 from app.ui.status import findings_html, log_html, settled, title, verdicts
 from app.ui.transport import where
 from tests.ui.fake_engine import FINDINGS, FakeEngine
@@ -41,6 +42,15 @@ def test_findings_that_need_the_user_come_first_with_their_option() -> None:
     assert "<code>--set imu.max_gap=0.4</code>" in text
     assert verdicts(FINDINGS) == ("2 checks passed, 1 corrected, 1 needs attention", BAD)
     assert verdicts(FINDINGS[:1]) == ("1 check passed", GOOD) and verdicts(()) is None
+
+
+def test_the_time_of_every_stage_has_its_unit() -> None:
+    engine = FakeEngine(frames=2)
+    engine.send(StepFrame())
+    result = engine.snapshot.result
+    assert result is not None
+    shown = times_html(engine.snapshot, result)
+    assert all(re.search(rf"{stage} [\d.–]+ ms", shown) for stage in STAGES)
 
 
 @pytest.mark.parametrize(
