@@ -86,6 +86,21 @@ def test_the_transport_lies_along_the_scene_and_what_was_unfolded_stays_so_after
     expect(timeline(bench)).to_be_visible()
 
 
+def test_no_sign_below_the_track_stands_without_its_name(bench: Bench) -> None:
+    cut = """() => { const row = document.querySelector('body > * .hs-marks'), box = row.getBoundingClientRect();
+      return [...row.children].map((one) => one.getBoundingClientRect())
+        .filter((one) => one.top < box.bottom && one.left < box.right && one.right > box.right + 0.5).length; }"""
+    shown: set[int] = set()
+    try:
+        for width in range(1000, 1400, 50):
+            bench.page.set_viewport_size({"width": width, "height": 620})
+            bench.page.wait_for_timeout(700)
+            shown.add(bench.page.evaluate(cut))
+    finally:
+        bench.page.set_viewport_size({"width": 1000, "height": 620})
+    assert shown == {0}
+
+
 def test_a_copy_of_the_strips_that_the_page_drops_while_it_loads_leaves_the_strips_alone(bench: Bench) -> None:
     dropped = (
         "() => new Promise((done) => { const box = document.createElement('div');"
