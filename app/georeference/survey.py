@@ -10,11 +10,16 @@ from app.slam.arrays import Vector
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """Where a control point is on what a keyframe saw, so that it moves with the map. at: m, in its IMU frame."""
+    """Where a control point is on what a keyframe saw, so that it moves with the map.
+
+    Attributes:
+        at: m, in the keyframe's IMU frame. frame: of the keyframe, since other settings make others; -1: not known.
+    """
 
     name: str
     keyframe: int
     at: Vector
+    frame: int = -1
 
 
 @dataclass(frozen=True, slots=True)

@@ -97,8 +97,11 @@ def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool])
     table = control_table(survey.control)
     picked = {}
     for pick in survey.picks:
-        if 0 <= pick.keyframe < len(results.keyframes):
-            T = results.frame.at(pick.keyframe) @ results.keyframes[pick.keyframe].T_odom_imu
+        if not 0 <= pick.keyframe < len(results.keyframes):
+            continue
+        keyframe = results.keyframes[pick.keyframe]
+        if pick.frame in (-1, keyframe.frame):
+            T = results.frame.at(pick.keyframe) @ keyframe.T_odom_imu
             picked[pick.name] = lie.moved(T, pick.at)
     return align_with_points(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overridden=overridden)
 

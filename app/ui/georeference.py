@@ -172,7 +172,7 @@ class GeoreferencePanel:
         if survey is None:
             return
         others = tuple(pick for pick in survey.picks if pick.name != name)
-        self._page.send(Georeference(replace(survey, picks=(*others, Pick(name, spot.keyframe, at)))))
+        self._page.send(Georeference(replace(survey, picks=(*others, Pick(name, spot.keyframe, at, spot.frame)))))
         left = [one for one in self._name.options if one not in {pick.name for pick in others} | {name}]
         if left:
             show(self._name, left[0])
