@@ -263,6 +263,9 @@ class FilesPanel:
         def confirmed(_: object) -> None:
             formats = (_FORMATS[files.value],) if files.value in _FORMATS else ()
             try:
+                now = self._page.snapshot().recording
+                if now is None or now.path != recording.path:
+                    raise HemislamError("Another recording is open by now; cancel, and save its results anew.")
                 folder = self._results / folder_name(name.value)
                 choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
             except HemislamError as error:

@@ -13,12 +13,12 @@ import viser
 from app.mapping.kept import Note
 from app.mapping.session_file import Opened, SavedSession, State, write_session
 from app.server.folders import Folders
-from app.server.protocol import Command, OpenedRecording, OpenRecording, Restart, Saved, Snapshot, Transport
+from app.server.protocol import Command, OpenedRecording, OpenRecording, Restart, Save, Saved, Snapshot, Transport
 from app.slam.errors import HemislamError
 from app.slam.loops.edits import Reject
 from app.slam.params import Params
 from app.ui.files import FilesPanel, RecentPanel
-from tests.ui.conftest import page_of, user_clicks, user_sets
+from tests.ui.conftest import Browser, page_of, user_clicks, user_sets
 
 STATE = State(Params(), edits=(Reject(3, 9), Reject(4, 9)), notes=(Note(4, "a door"),))
 
@@ -90,3 +90,19 @@ def test_results_that_are_gone_are_not_offered_as_an_empty_list(server: viser.Vi
     assert files._download.visible and f"{tmp_path / 'gone'}" in files._saved.content
     with pytest.raises(HemislamError, match="is gone; save the results again"):
         files._offer(None)  # type: ignore[arg-type]
+
+
+def test_results_are_not_saved_under_the_name_of_a_recording_that_is_no_longer_open(
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    now, sent = [opened(tmp_path / "walk.mcap", 9)], list[Command]()
+    files = FilesPanel(page_of(server, sent.append, lambda: now[0]), Folders([tmp_path]), tmp_path)
+    browser = Browser(server, monkeypatch)
+    files.ask_where(browser)  # type: ignore[arg-type]
+    (save,) = browser.added["Save"]._impl.update_cb
+    now[0] = opened(tmp_path / "hall.mcap", 9)  # another page opens it
+    save(None)
+    assert not sent
+    now[0] = opened(tmp_path / "walk.mcap", 20)
+    save(None)
+    assert [type(command) for command in sent] == [Save]
