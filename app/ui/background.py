@@ -1,5 +1,6 @@
 """Work of a panel in a process of its own, so that the page stays quick."""
 
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -22,6 +23,7 @@ class Background:
     def __init__(self, gui: viser.GuiApi, name: str, title: str, hint: str | None = None) -> None:
         self._name, self._title = name, title
         self._child: Child | None = None
+        self._beginning = threading.Lock()
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._stop = add_button(gui, "Stop", lambda _: self.stop(), viser.Icon.PLAYER_STOP, visible=False, hint=hint)
 
@@ -30,9 +32,13 @@ class Background:
         return self._child is not None
 
     def begin(self, main: Callable[..., None], *args: Any) -> None:
-        self.show(0.0)
-        self._child = Child(_told, main, *args, name=self._name, title=self._title, fork=True, grace_s=0.0)
-        self._bar.visible = self._stop.visible = True
+        """Begin, unless another page has."""
+        with self._beginning:
+            if self.running:
+                return
+            self.show(0.0)
+            self._child = Child(_told, main, *args, name=self._name, title=self._title, fork=True, grace_s=0.0)
+            self._bar.visible = self._stop.visible = True
 
     def show(self, share: float) -> None:
         """Show how much is done, 0-1."""

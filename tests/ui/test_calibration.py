@@ -1,5 +1,7 @@
 """Tests app/ui/calibration.py: the calibration panel shows what a process of its own found, and applies it."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -276,3 +278,21 @@ def test_a_doubt_about_an_earlier_recording_says_nothing_about_this_one(unasked:
     given = replace(OPEN, params=Params().with_values({"sensor.rotation": [0, 0, 90]}), notices=before)
     unasked.draw(given)
     assert unasked.process() is None
+
+
+def test_two_pages_that_press_calibrate_at_once_start_one_process(
+    page: Calibrating, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[Process] = []
+
+    class Slow(Process):
+        def __init__(self, *args: Any, **more: Any) -> None:
+            super().__init__(*args, **more)
+            started.append(self)
+            time.sleep(0.3)
+
+    monkeypatch.setattr(background, "Child", Slow)
+    with ThreadPoolExecutor(2) as threads:
+        for _ in range(2):
+            threads.submit(page.panel._begin)
+    assert len(started) == 1 and page.process() is started[0]
