@@ -47,8 +47,7 @@ class Session:
 
     Args:
         loops: makes the client that looks for loops, `InlineLoops` for example; None: odometry alone.
-        truth: a trajectory (TUM) to compare with.
-        checkpoints: to go back to; None: the session only goes on.
+        truth: a trajectory (TUM) to compare with. checkpoints: to go back to; None: the session only goes on.
 
     Attributes:
         frame: index of the newest frame, -1 before the first. result: of it; None before the first frame and right
@@ -59,8 +58,7 @@ class Session:
         history: parameters by the frame from which they apply, ascending.
         ended: the feed has no more to give. keyframes: with all layers of labels.
         calibration: what the recording shows about its sensors, in a sentence, for the report; "" if nothing.
-        survey: what the results are georeferenced by; None: nothing.
-        adjustment: of the map by that and by gravity, as it is shown.
+        survey: what the results are georeferenced by, or None. adjustment: of the map by that and by gravity.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -207,6 +205,8 @@ class Session:
         usable = params.with_values({path: self.params.value(path) for path in waiting})
         if usable != self.params:
             self._forget_after(max(self.frame, self.heading))
+            if self.loops and usable.keyframe != self.params.keyframe and self.known >= self.heading:
+                self.loops.leave_out(sum(one.keyframe for one in self.frames))
             self.params = self.engine.params = usable
             self._moving.choose(usable.moving)
 

@@ -316,6 +316,8 @@ class Controller:
         self._keep(kept)
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
+            if any(params.keyframe != self._params.keyframe for _, params in before.history):
+                session.loops.leave_out(0)
 
     def _resume(self, path: Path) -> None:
         """Open the recording of a session file, and repeat the session up to its frame."""

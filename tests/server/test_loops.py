@@ -23,13 +23,16 @@ from app.server.protocol import (
     InspectLoop,
     Pause,
     Play,
+    Restart,
     Save,
     Seek,
+    SetParams,
     SetSpeed,
     Snapshot,
     TryLoop,
     UndoLoop,
 )
+from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edits import Reject, SetWeight
 from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.params import Params
@@ -186,3 +189,17 @@ def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
     assert walk.see().loops.undo == (Reject(*pair),)
     walk.do(UndoLoop())
     assert walk.saved(tmp_path) == files
+
+
+def test_edits_do_not_pass_to_the_loops_of_other_keyframes() -> None:
+    """Keyframes are numbered in their order, so with other settings the same numbers are other places."""
+    walk = Walk()
+    rejected = [EditLoop(Reject(*edge.pair)) for edge in accepted(walk.end())]
+    assert walk.do(*rejected, SetParams({"keyframe.distance": 1.0})).loops.undo, "for keyframes to come only"
+    after = walk.do(Restart())
+    assert not after.loops.undo and any("Edits of loops are left out" in notice.text for notice in after.notices)
+    edited = walk.do(Play(), EditLoop(Reject(KeyframeId(0, 2), KeyframeId(0, 9))))
+    assert edited.loops.undo and walk.do(Restart()).loops.undo, "the same keyframes come again"
+    went_on = walk.do(Seek(5), SetParams({"keyframe.distance": 0.5}))
+    assert not went_on.loops.undo
+    walk.controller.close()

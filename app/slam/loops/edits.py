@@ -107,6 +107,14 @@ class Edits:
             raise HemislamError("There is no edit to redo.")
         return Edits((*self.done, self.undone[-1]), self.undone[:-1])
 
+    def among(self, count: int) -> "Edits":
+        """Those that name no later keyframe than the first `count`."""
+
+        def kept(edits: tuple[LoopEdit, ...]) -> tuple[LoopEdit, ...]:
+            return tuple(edit for edit in edits if edit.pair is None or edit.pair[1].index < count)
+
+        return Edits(kept(self.done), kept(self.undone))
+
 
 def rows(T: F64) -> tuple[tuple[float, ...], ...]:
     """A matrix as an edit holds it."""

@@ -46,6 +46,9 @@ MOST_AHEAD: Final = 8
 """Questions without an answer at which frames wait all the same, so that keyframes do not pile up in memory."""
 STATES: Final = 512
 """States that are kept, so that going back need not solve the graph again."""
+LEFT_OUT: Final = (
+    "Edits of loops are left out: other settings choose other keyframes, so the loops that they name are others now."
+)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -186,6 +189,12 @@ class LoopSchedule:
         """Ask on behalf of the user, or change the edits; `poll` until it is `idle` brings the answer."""
         self._requests.append(request)
         self._ask_next()
+
+    def leave_out(self, count: int) -> None:
+        """Take out the edits that name later keyframes than the first `count`: others will take their place."""
+        if self.edits.among(count) != self.edits:
+            self.command(lambda edits: edits.among(count))
+            self._notices.append(LEFT_OUT)
 
     def poll(self) -> None:
         """Take in what has been answered, without waiting."""
