@@ -14,6 +14,8 @@ from app.slam.errors import HemislamError
 _DAY_S = 86_400.0
 _YEARS = range(1980, 2200)
 """Since GPS time began, and as far as stamps in ns go."""
+_PAUSE_NS = 60_000_000_000
+"""After a longer one, the day may be another one."""
 _NOBODY = (float("nan"),) * 3
 
 
@@ -22,15 +24,18 @@ class _Log:
     """What the sentences of a receiver say, in its order.
 
     Attributes:
-        near_ns: a time within half a day, for sentences before the first one with a date.
+        walk_ns: the time of the walk: of two dates that contradict each other without a pause, the nearer one counts.
+        near_ns: a time within half a day, for sentences without a date; at first that of the walk.
         places: latitude and longitude in degrees, height above the geoid and the geoid's above the ellipsoid (nan if
             not told), m. stamps, at: of each place, in ns and in s of the day.
         sigmas: m to the east, north and up by s of the day.
         fixed: the last GGA or RMC has a fix; None before the first. Without one, the date of ZDA may be that of the
             receiver's own clock.
         early: day and s of it, by the last ZDA before the first GGA or RMC, which says whether it counts.
+        begin: the first place after the last pause. dated: a sentence has said its day.
     """
 
+    walk_ns: int
     near_ns: int
     places: list[tuple[float, float, float, float]] = field(default_factory=list)
     stamps: list[int] = field(default_factory=list)
@@ -38,6 +43,8 @@ class _Log:
     sigmas: dict[float, tuple[float, float, float]] = field(default_factory=dict)
     fixed: bool | None = None
     early: tuple[datetime, float] | None = None
+    begin: int = 0
+    dated: bool = False
 
     def add(self, line: str) -> None:
         """One line; anything but a whole sentence with the right checksum is ignored."""
@@ -74,7 +81,7 @@ class _Log:
     def _place(self, words: list[str]) -> None:
         latitude, longitude = _degrees(words[1], words[2]), _degrees(words[3], words[4])
         at = _seconds(words[0])
-        self.near_ns = _nearest(at, self.near_ns)
+        self.near_ns = self._guessed(at)
         self.places.append((latitude, longitude, float(words[8]), float(words[10] or "nan")))
         self.stamps.append(self.near_ns)
         self.at.append(at)
@@ -82,12 +89,20 @@ class _Log:
     def _day(self, day: datetime, at_s: float) -> None:
         if day.year not in _YEARS:
             return
-        at = round(at_s * 1e9)
-        stamp_ns = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + at
-        off = round((stamp_ns - _nearest(at * 1e-9, self.near_ns)) / (_DAY_S * 1e9)) * round(_DAY_S * 1e9)
-        if off:  # the day was guessed so far
-            self.stamps = [stamp + off for stamp in self.stamps]
-        self.near_ns = stamp_ns
+        stamp_ns = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + round(at_s * 1e9)
+        guessed_ns = self._guessed(at_s)
+        if self.dated and abs(stamp_ns - self.walk_ns) >= abs(guessed_ns - self.walk_ns):
+            return
+        off = stamp_ns - guessed_ns
+        self.stamps[self.begin :] = [stamp + off for stamp in self.stamps[self.begin :]]
+        self.near_ns, self.dated = stamp_ns, True
+
+    def _guessed(self, at_s: float) -> int:
+        """The stamp of a time of the day, on the day of the sentences so far unless there was a pause."""
+        stamp_ns = _nearest(at_s, self.near_ns)
+        if abs(stamp_ns - self.near_ns) > _PAUSE_NS:
+            self.begin, self.dated = len(self.stamps), False
+        return stamp_ns
 
 
 def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
@@ -96,7 +111,7 @@ def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
     Raises:
         HemislamError: naming `source`: there is no GGA sentence with a place.
     """
-    log = _Log(near_ns)
+    log = _Log(near_ns, near_ns)
     for line in lines:
         log.add(line)
     if not log.places:

@@ -91,3 +91,39 @@ def test_heights_of_one_log_are_all_above_the_same_surface() -> None:
 def test_a_wrong_checksum_a_cut_line_or_no_fix_give_nothing(line: str) -> None:
     with pytest.raises(HemislamError, match="no NMEA sentence GGA"):
         nmea.read([line], "log", 0)
+
+
+def second(at: int, date: str = "", *, last: str = "") -> list[str]:
+    """GGA at 10:00 and so many seconds, after RMC with a date, before one with another."""
+    time = f"10{at // 60:02d}{at % 60:02d}.00"
+    rmc = [sentence(f"GPRMC,{time},A,4807.038,N,01131.000,E,0.4,84.4,{day},,") if day else "" for day in (date, last)]
+    return [rmc[0], sentence(f"GPGGA,{time},4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"), rmc[1]]
+
+
+WALK_NS = 1_711_188_000 * 10**9
+"""2024-03-23T10:00:00Z."""
+
+
+@pytest.mark.parametrize("wrong", ["070804", "220324", "240324"], ids=["1024 weeks early", "a day early", "a day late"])
+@pytest.mark.parametrize("when", [(0,), (5,), (9,), (7, 8, 9), (0, 1, 2)], ids=str)
+@pytest.mark.parametrize("before", [True, False], ids=["date first", "date last"])
+def test_a_wrong_date_does_not_move_fixes_of_the_walk(wrong: str, when: tuple[int, ...], before: bool) -> None:
+    dates = [wrong if at in when else "230324" for at in range(10)]
+    lines = [second(at, date) if before else second(at, last=date) for at, date in enumerate(dates)]
+    fixes, _ = nmea.read([line for one in lines for line in one], "log", WALK_NS + 3 * 10**9)
+    assert [(stamp - WALK_NS) / 1e9 for stamp in fixes.stamps_ns.tolist()] == list(range(10))
+
+
+@pytest.mark.parametrize("walk", [0, 4])
+@pytest.mark.parametrize("before", [True, False], ids=["date first", "date last"])
+def test_a_log_of_several_days_keeps_each_on_its_own(walk: int, before: bool) -> None:
+    """As of a logger that appends to its file."""
+    days = {0: range(5), 4: range(120, 125)}
+    lines: list[str] = []
+    for day, seconds in days.items():
+        for at in seconds:
+            date = f"{23 + day}0324"
+            lines += second(at, date) if before else second(at, last=date)
+    fixes, _ = nmea.read(lines, "log", WALK_NS + walk * DAY_S * 10**9)
+    expected = [day * DAY_S + at for day, seconds in days.items() for at in seconds]
+    assert [(stamp - WALK_NS) / 1e9 for stamp in fixes.stamps_ns.tolist()] == expected
