@@ -66,7 +66,7 @@ def of_box(read: Callable[[], Iterable[Block]], box: Box | None, where: GeoRefer
         HemislamError: no box is chosen, or nothing is in it.
     """
     if box is None:
-        raise HemislamError("A section shows what lies in a box; choose one in the page, or by --box.")
+        raise HemislamError("A section shows what lies in a box; choose a box first.")
 
     def placed(block: Block) -> tuple[F64, U8]:
         chainage = box.own(block.points)[:, 0] + box.size[0] / 2

@@ -54,7 +54,7 @@ def recorded_fixes(recording: Path) -> Fixes:
     with Source(recording) as source:
         topic = navsat_topic(source)
         if not topic:
-            raise HemislamError(f"{recording} has no topic of type {NAVSAT} with fixes; give a file with --gnss.")
+            raise HemislamError(f"{recording} has no topic of type {NAVSAT} with fixes; give a file of fixes.")
         every = [fix_of(message) for _, _, message in source.messages((topic,))]
     columns = ("stamps_ns", "latitude", "longitude", "height", "sigmas")
     return Fixes(*(np.concatenate([getattr(fix, name) for fix in every]) for name in columns)).sound(

@@ -162,7 +162,7 @@ def test_a_walker_who_sways_walks_no_longer_way() -> None:
 
 def test_a_slab_without_points_or_walk_is_reported(tmp_path: Path) -> None:
     results = room()
-    with pytest.raises(HemislamError, match="choose one in the page, or by --box"):
+    with pytest.raises(HemislamError, match="choose a box first"):
         save_results(tmp_path, results, of_formats(["section"]))
     results.choice = Choice(box=Box((90.0, 90, 90), (91.0, 91, 91)))
     with pytest.raises(HemislamError, match="no points in the slab"):

@@ -64,7 +64,7 @@ def test_a_fix_survives_its_message_and_a_covariance_of_unknown_type_is_unknown(
 
 def test_a_recording_without_a_receiver_says_what_to_give(tmp_path: Path) -> None:
     simulate("room", tmp_path / "walk.mcap", duration_s=0.5, every_block=90)
-    with pytest.raises(HemislamError, match="give a file with --gnss"):
+    with pytest.raises(HemislamError, match="; give a file of fixes"):
         recorded_fixes(tmp_path / "walk.mcap")
 
 
