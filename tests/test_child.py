@@ -328,6 +328,28 @@ for fork in (False, True):
     assert (done.stdout.split(), done.stderr) == (["run", "hello", "hello"], "")
 
 
+def runs_nothing(owner: Link, folder: str) -> None:
+    from app.evaluation.runner import run_jobs
+
+    run_jobs([], Path(folder), parallel=1, quiet=True)
+    owner.send("ran")
+    owner.receive()
+
+
+def test_runs_that_are_killed_leave_no_semaphore_of_which_python_would_warn(tmp_path: Path) -> None:
+    code = f"""
+import sys
+sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}
+import test_child
+from app.child import Child
+child = Child(test_child.runs_nothing, {str(tmp_path)!r}, name="tune", title="The search", fork=True)
+print(child.receive(60.0))
+child.close(0.0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=90)
+    assert (done.stdout.split(), done.stderr) == (["ran"], "")
+
+
 def test_restarts_are_allowed_so_often_within_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("app.child.time.monotonic", lambda: now)

@@ -18,6 +18,7 @@ from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 
 REPORT_EVERY_S = 0.2
+tqdm.set_lock(threading.RLock())  # its own is a semaphore of processes, which stays where this one is killed
 
 
 RunJobs = Callable[[list[Job], Path], dict[tuple[str, str], str]]
