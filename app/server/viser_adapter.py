@@ -68,6 +68,7 @@ def start_viser() -> Viser:
     viser itself accepts every Origin, so any web page that the user has open could drive it.
     """
     key = secrets.token_urlsafe(24)
+    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection")  # a page may leave at any moment
     _list_icons_once()
     with _require_key(key), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)

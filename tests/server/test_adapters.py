@@ -4,6 +4,7 @@ Tests app/server/viser_adapter.py.
 """
 
 import ast
+import warnings
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,9 @@ import viser
 import viser._icons
 import viser._messages
 import websockets.asyncio.server
+from server_site import CAMERA, PROTOCOL, packed, until
 from viser.infra import WebsockServer
+from websockets.sync.client import connect
 
 from app.server import viser_adapter
 from app.server.bridge import NEVER, VIEWER_MESSAGES
@@ -118,6 +121,20 @@ def test_viser_has_the_websocket_server_that_the_adapter_configures(target: Vise
         "viser's message buffer has no `max_window_size`, so `viser_adapter.MOST_AT_ONCE` has no effect."
     )
     assert buffer.max_window_size == viser_adapter.MOST_AT_ONCE
+
+
+def test_a_page_that_leaves_while_its_camera_moves_is_no_warning_in_the_log() -> None:
+    with warnings.catch_warnings(record=True) as told:
+        running = viser_adapter.start_viser()
+        headers = {viser_adapter.KEY_HEADER: running.key}
+        with connect(running.url, subprotocols=[PROTOCOL], additional_headers=headers, proxy=None) as browser:
+            browser.send(packed(**CAMERA))
+            until(lambda: bool(running.server.get_clients()))
+            (client,) = running.server.get_clients().values()
+        until(lambda: not running.server.get_clients())
+        client.camera.position = (1.0, 2.0, 3.0)
+        running.stop()
+    assert not [str(one.message) for one in told if issubclass(one.category, UserWarning)]
 
 
 def test_visers_page_has_what_the_adapter_replaces() -> None:
