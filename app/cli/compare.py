@@ -57,8 +57,8 @@ def compare(
 
 def _check(out: Path, *maps: Path) -> None:
     """Refuse, before the work, what cannot be written or would replace what is compared."""
-    if out.is_dir() or not out.parent.is_dir():
-        raise HemislamError(f"{out} cannot be written; choose a file in a folder that exists as --out.")
+    if out.suffix.lower() != ".ply" or out.is_dir() or not out.parent.is_dir():
+        raise HemislamError(f"{out} cannot be written; choose a .ply file in a folder that exists as --out.")
     try:
         with NamedTemporaryFile(dir=out.parent):
             pass

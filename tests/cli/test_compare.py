@@ -72,6 +72,7 @@ def test_a_comparison_replaces_no_map_and_needs_a_folder_that_exists(
         (results / "map.ply", "a map to compare"),
         (tmp_path / "nowhere" / "apart.ply", "cannot be written"),
         (tmp_path, "cannot be written"),
+        (tmp_path / "changes.laz", "choose a .ply file"),
     ):
         assert says in hemislam("compare", results, other, "--out", out).refused()
     refused = hemislam("compare", "nothing.ply", other, "--out", "/proc/apart.ply").refused()
