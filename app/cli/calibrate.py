@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.options import ParamsFor, RecordingPath, progress_bar, with_params
+from app.cli.options import MOST_S, ParamsFor, RecordingPath, progress_bar, with_params
 from app.slam.errors import HemislamError
 from app.slam.text_files import write_texts
 
@@ -26,7 +26,8 @@ def calibrate(
         Path | None, typer.Option("--plot", metavar="FILE.svg", help="Draw the residuals before and after.")
     ] = None,
     duration: Annotated[
-        float, typer.Option("--duration", min=5, metavar="SECONDS", help="Use only this much of the recording.")
+        float,
+        typer.Option("--duration", min=5, max=MOST_S, metavar="SECONDS", help="Use only this much of the recording."),
     ] = 120.0,
 ) -> None:
     """Find the pose of the LiDAR on the IMU, the offset of their clocks and the errors of each scan line.

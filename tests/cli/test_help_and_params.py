@@ -103,6 +103,7 @@ def test_a_start_that_no_clock_can_count_is_refused(hemislam: Call, walk: Path, 
     assert "--start" in hemislam(command, walk, "--start", value).err
     assert hemislam(command, walk, "--start", value).code == 2
     assert hemislam(command, walk, "--duration", value).code == 2
+    assert hemislam("calibrate", walk, "--duration", value).code == 2
 
 
 def test_simulate_keeps_a_file_that_is_there_and_names_the_scenes(hemislam: Call, tmp_path: Path) -> None:
