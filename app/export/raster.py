@@ -65,7 +65,7 @@ def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, c
     for points, _ in _points(read, where):
         low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     if not np.isfinite(low).all():
-        raise HemislamError("There are no points to draw a plan of; choose a larger box.")
+        raise HemislamError("The map has no points to draw a plan of.")
     while np.prod((high - low)[:2] / cell + COARSE) > MOST_CELLS:
         cell *= 2
     origin = np.append(np.floor(low[:2] / (cell * COARSE)) * cell * COARSE, math.floor(low[2]))

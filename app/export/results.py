@@ -10,6 +10,7 @@ from app.export.points import EVERYTHING, Block, Choice, blocks
 from app.export.raster import CELL, Raster, rasterise
 from app.export.section import Slab, of_box, of_path
 from app.georeference.reference import GeoReference
+from app.slam.errors import HemislamError
 from app.slam.loops.files import LoopResults
 from app.slam.map_frame import MapFrame
 from app.slam.ply import Keyframes
@@ -75,9 +76,13 @@ class Results:
         return self._blocks(replace(self.choice, moving=False))
 
     def _blocks(self, choice: Choice) -> Iterator[Block]:
+        count = 0
         for number, block in enumerate(blocks(self.keyframes, self.frame, choice), 1):
+            count += len(block)
             yield block
             self.progress(number / len(self.keyframes))
+        if choice.box is not None and not count:
+            raise HemislamError("There are no points in the box; choose another one.")
 
     def raster(self, *, on_earth: bool, cell: float = CELL) -> Raster:
         """The map from above, counted once for all files that show it."""

@@ -90,6 +90,10 @@ def test_a_grid_that_cannot_be_used_costs_only_the_georeference(results: Path, h
         (("--format", " , "), "names no format"),
         (("--format", "laz", "--box", "1,2,3"), "--box takes six numbers"),
         (("--format", "gpx"), "needs a georeferenced map"),
+        *(
+            (("--format", name, "--box=90,90,90,91,91,91"), "no points in the box; choose another one")
+            for name in ("ply", "las", "laz", "e57", "pcd", "html", "floor")
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_said_in_a_sentence(

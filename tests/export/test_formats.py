@@ -17,13 +17,12 @@ from test_las import UTM, room
 from test_plan import room as plan_room
 
 from app.export import exports
-from app.export.box import Box
 from app.export.exports import of_formats, save_results
-from app.export.points import Choice
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.run_log import RunInfo
+from app.slam.types import MOVING
 
 
 @pytest.mark.parametrize("where", [None, UTM])
@@ -103,7 +102,7 @@ def test_a_recording_whose_name_is_no_utf_8_is_delivered(tmp_path: Path) -> None
 
 def test_a_page_without_any_point_still_shows_the_walk(tmp_path: Path) -> None:
     results = plan_room()
-    results.choice = Choice(box=Box((900.0, 900.0, 900.0), (901.0, 901.0, 901.0)))
+    results.keyframes[0].cloud.labels[:] = MOVING
     save_results(tmp_path, results, of_formats(["html"]))
     assert "<br>0 points · " in (tmp_path / "share.html").read_text()
 

@@ -117,7 +117,7 @@ def test_a_plan_needs_ground_and_points(tmp_path: Path) -> None:
     with pytest.raises(HemislamError, match="No point of the map is ground"):
         save_results(tmp_path, results, of_formats(["terrain"]))
     results.choice = Choice(box=Box((90.0, 90, 90), (91, 91, 91)))
-    with pytest.raises(HemislamError, match="no points to draw a plan of; choose a larger box"):
+    with pytest.raises(HemislamError, match="no points in the box; choose another one"):
         save_results(tmp_path, results, of_formats(["terrain"]))
 
 

@@ -165,7 +165,7 @@ def test_a_slab_without_points_or_walk_is_reported(tmp_path: Path) -> None:
     with pytest.raises(HemislamError, match="choose a box first"):
         save_results(tmp_path, results, of_formats(["section"]))
     results.choice = Choice(box=Box((90.0, 90, 90), (91.0, 91, 91)))
-    with pytest.raises(HemislamError, match="no points in the slab"):
+    with pytest.raises(HemislamError, match="no points in the box"):
         save_results(tmp_path, results, of_formats(["section"]))
     standing = Results(RunLog(results.log.frames[:1]), results.keyframes, results.info)
     with pytest.raises(HemislamError, match=r"shorter than 0\.5 m"):
