@@ -99,18 +99,19 @@ def export(
 def _export_session(source: Path, out: Path | None, exports: "tuple[Export, ...]", choice: "Choice") -> None:
     from app.cli.replay import repeat
     from app.cli.run import free_folder
+    from app.export.exports import results_folder
     from app.georeference import reference
     from app.mapping.earth import georeference_if_possible
     from app.mapping.saving import mark
     from app.mapping.session_file import read_session
 
-    with repeat(source) as (session, stop):
+    folder = out or free_folder(source)
+    with results_folder(folder, replace=True), repeat(source) as (session, stop):
         if stop is not None:
             raise stop
         results = session.results()
         mark(results, read_session(source).state)
         results = georeference_if_possible(results, session.survey, session.edits.done)
-        folder = out or free_folder(source)
         if results.where is None:
             results.where, problem = reference.read(source.parent)
             if problem and folder.resolve() == source.parent.resolve():

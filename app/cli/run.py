@@ -76,20 +76,20 @@ def run(
     params = params_for(recording)
     say_calibrated(recording)
     edits = edit_files.read(read_text(loops, "save edits of loops in the workbench"), str(loops)) if loops else ()
-    params, advised = settle_mounting(recording, params) if calibrate else (params, "")
-    if advised:
-        typer.echo(advised)
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
-    session = open_session(recording, params, start, duration, truth=truth_path, read_ahead=True)
-    try:
-        if truth_path:
-            check_poses(truth_path)
-        if truth:
-            session.compare_with(truth)
-        elif truth_path:
-            typer.echo(f"Using the truth beside the recording: {truth_path}")
-        with results_folder(folder, replace=force):
+    if truth_path:
+        check_poses(truth_path)
+    with results_folder(folder, replace=force):
+        params, advised = settle_mounting(recording, params) if calibrate else (params, "")
+        if advised:
+            typer.echo(advised)
+        session = open_session(recording, params, start, duration, truth=truth_path, read_ahead=True)
+        try:
+            if truth:
+                session.compare_with(truth)
+            elif truth_path:
+                typer.echo(f"Using the truth beside the recording: {truth_path}")
             for finding in session.findings:
                 if finding.verdict != "fine":
                     typer.echo(f"{finding.verdict}: {finding.subject}: {finding}")
@@ -105,8 +105,8 @@ def run(
                 advised = look_for_mounting(recording, params)
             session.calibration = advised
             save(session, folder, stop, replace=force)
-    finally:
-        session.close()
+        finally:
+            session.close()
 
 
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:

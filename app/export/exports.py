@@ -186,9 +186,9 @@ def results_folder(folder: Path, *, replace: bool = False) -> Iterator[None]:
     try:
         yield
     finally:
-        if new:
-            with contextlib.suppress(OSError):  # it holds something
-                folder.rmdir()
+        with contextlib.suppress(OSError):  # one holds something
+            for made in new:
+                made.rmdir()
 
 
 def save_results(

@@ -41,10 +41,10 @@ def is_file(path: Path) -> bool:
     return False
 
 
-def make_folder(folder: Path) -> bool:
-    """Whether the folder was not there yet. Raises HemislamError if it cannot be created."""
+def make_folder(folder: Path) -> list[Path]:
+    """What had to be made for it to be there, the folder itself first. Raises HemislamError if it cannot be made."""
     try:
-        new = not folder.exists()
+        new = [one for one in (folder, *folder.parents) if not one.exists()]
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise HemislamError(f"The folder {folder} cannot be made: {error.strerror}; choose another one.") from None

@@ -110,3 +110,11 @@ def test_results_are_not_exported_onto_themselves(results: Path, hemislam: Call,
     )
     assert (results / "map.ply").read_bytes() == before
     assert "no map.ply" in hemislam("export", tmp_path, "--format", "ply").err
+
+
+def test_where_nothing_can_be_written_a_session_is_not_repeated_first(
+    hemislam: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (there := tmp_path / "there").write_bytes(b"mine")
+    monkeypatch.setattr("app.cli.replay.repeat", lambda _: pytest.fail("it is repeated first"))
+    assert "cannot be made" in hemislam("export", tmp_path / "s.hemislam", "--format", "tum", "--out", there).err

@@ -193,8 +193,11 @@ def test_a_truth_of_another_day_or_none_at_all_or_whose_frame_jumps_is_refused(
     assert not (tmp_path / "runs").exists()
 
 
-def test_results_are_kept_unless_told_otherwise(first: tuple[Any, Path], hemislam: Call, walk: Path) -> None:
+def test_results_are_kept_unless_told_otherwise(
+    first: tuple[Any, Path], hemislam: Call, walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = {path.name: path.read_bytes() for path in first[1].iterdir()}
+    monkeypatch.setattr("app.cli.run.settle_mounting", lambda *_: pytest.fail("it is calibrated first"))
     assert "--force" in hemislam("run", walk, "--out", first[1]).refused()
     assert {path.name: path.read_bytes() for path in first[1].iterdir()} == before
 
