@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -206,8 +207,8 @@ def read_subjects(
     subjects: list[Subject] = []
     for path, text in zip(paths, texts, strict=True):
         stem = path.resolve().stem
-        count = sum(one.name == stem or one.name.startswith(f"{stem}~") for one in subjects)
-        name = f"{stem}~{count + 1}" if count else stem
+        taken = [one.name for one in subjects]
+        name = next(name for name in chain([stem], (f"{stem}~{n}" for n in count(2))) if name not in taken)
         params = params_for(path)
         subjects.append(
             Subject(name, path, params, read_truth(text, path, lever) if text not in ("", "none") else None)

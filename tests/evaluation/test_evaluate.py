@@ -20,6 +20,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.cli.evaluate import read_subjects
 from app.evaluation.variants import PAPER, choose_variants, parse_variant
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -217,3 +218,9 @@ def test_what_cannot_be_done_is_said_in_one_sentence(
     assert done.exit_code == 2 and not out.exists()
     assert says in done.stderr and "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_each_recording_has_a_name_of_its_own(tmp_path: Path) -> None:
+    paths = [tmp_path / folder / f"{name}.mcap" for folder, name in (("a", "x~2"), ("a", "x"), ("b", "x"), ("c", "x"))]
+    names = [subject.name for subject in read_subjects(paths, lambda *_, **__: Params(), ["none"] * 4)]
+    assert names == ["x~2", "x", "x~3", "x~4"]
