@@ -10,7 +10,6 @@ import typer
 from app.cli.evaluate import ClusterAddress, ClusterData, Jobs, Out, PartStart, Truths, read_subjects, runner
 from app.cli.options import MOST_S, Duration, ParamsFor, with_params
 from app.slam.errors import HemislamError
-from app.slam.text_files import make_folder
 
 
 @with_params
@@ -107,9 +106,8 @@ def tune(
         raise HemislamError("--held-back needs --duration: without it the search sees the whole recording.")
     part = Part(start, duration)
     rest = part.next(held_back) if held_back != 0 and not marks else None
-    make_folder(out)
     run = runner(jobs or parallel_runs(wanted), cluster, cluster_data, quiet=True)
-    runs = Runs(subjects, wanted, out, run)
+    runs = Runs(subjects, wanted, out, run, start)
     compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:
 

@@ -91,7 +91,7 @@ def evaluate(
                 baseline=variant.baseline,
                 marks=subject.marks,
             )
-    make_folder(folder)
+    make_folder(folder / "runs")
     failures = run(list(jobs.values()), folder / "runs")
     evaluated = []
     for subject in subjects:

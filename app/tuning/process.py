@@ -94,6 +94,6 @@ def find(owner: Link, wanted: Wanted) -> None:
         owner.send(latest)
 
     run = partial(run_jobs, parallel=parallel_runs(objectives), quiet=True, ended=ended)
-    runs = Runs([subject], objectives, wanted.folder, run)
+    runs = Runs([subject], objectives, wanted.folder, run, wanted.start_s)
     _, checked = tune(runs, search, wanted.folder, progress)
     owner.send(replace(latest, held_back=checked, finished=True))

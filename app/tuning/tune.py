@@ -17,6 +17,7 @@ from app.evaluation.measured import load, measure
 from app.evaluation.runner import RunJobs
 from app.slam.params import Params
 from app.slam.provenance import cores
+from app.slam.text_files import make_folder
 from app.tuning.objectives import Objective, score
 from app.tuning.report import write_results
 from app.tuning.space import Dimension, grid
@@ -74,18 +75,23 @@ class Runs:
     """Runs settings on all recordings and scores them.
 
     Args:
-        folder: of the search; finished runs beside it are found again. run: as `evaluate`.
+        folder: of the search; finished runs beside it are found again. run: as `evaluate`. start_s: of the part.
 
     Raises:
-        HemislamError: a recording cannot be used.
+        HemislamError: a recording cannot be used, or ends before the part.
     """
 
     def __init__(
-        self, subjects: Sequence[Subject], objectives: Sequence[Objective], folder: Path, run: RunJobs
+        self,
+        subjects: Sequence[Subject],
+        objectives: Sequence[Objective],
+        folder: Path,
+        run: RunJobs,
+        start_s: float = 0.0,
     ) -> None:
         self._subjects, self._objectives, self._run = subjects, objectives, run
         self._folder, self._known = folder / "runs", _known_runs(folder.resolve().parent)
-        self.hashes = [check_subject(subject) for subject in subjects]
+        self.hashes = [check_subject(subject, start_s) for subject in subjects]
 
     def asked(self, wanted: SearchPlan) -> dict[str, Any]:
         """What a search was asked for, as its report keeps it."""
@@ -154,6 +160,9 @@ def tune(runs: Runs, wanted: SearchPlan, folder: Path, progress: OnTrials) -> tu
     Raises:
         HemislamError: a grid has more points than trials, or the folder cannot be written to.
     """
+    if wanted.how == "grid":
+        grid(wanted.dimensions, wanted.trials)  # refused before anything runs
+    make_folder(folder / "runs")
     done, study = search(runs, wanted, progress)
     checked = check(runs, done, wanted.objectives, wanted.rest)
     write_results(folder, done, checked, wanted.objectives, study, runs.asked(wanted))

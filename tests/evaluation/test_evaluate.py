@@ -208,13 +208,14 @@ def test_two_variants_of_one_name_and_misspelt_parameters_are_refused() -> None:
         (["RECORDING", "--start", "10000"], "has no scan after 10000 s; it lasts"),
         (["RECORDING", "--truth", "topic:/odom"], "no topic /odom"),
         (["RECORDING", "--truth", "a", "--truth", "b"], "2 --truth options for 1 recordings"),
+        (["RECORDING", "--out", "/proc"], "The folder /proc/runs cannot be made"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_sentence(
     recording: Path, tmp_path: Path, arguments: list[str], says: str
 ) -> None:
     out = tmp_path / "out"
-    done = call(*(str(recording) if text == "RECORDING" else text for text in arguments), "--out", out)
+    done = call("--out", out, *(str(recording) if text == "RECORDING" else text for text in arguments))
     assert done.exit_code == 2 and not out.exists()
     assert says in done.stderr and "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

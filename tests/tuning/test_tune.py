@@ -275,3 +275,14 @@ def test_without_a_part_to_search_on_nothing_is_held_back(recording: Path, tmp_p
     result = CliRunner().invoke(cli, ["tune", str(recording), "--out", str(tmp_path / "out"), "--held-back", "5"])
     assert result.exit_code == 2
     assert "needs --duration" in result.output
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"), [(("--start", "100"), "no scan after 100 s"), (("--trials", "1"), "more than 1 trials")]
+)
+def test_what_cannot_be_searched_is_refused_before_anything_runs(
+    recording: Path, tmp_path: Path, words: tuple[str, ...], complaint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.evaluation.runner.run_jobs", lambda *_, **__: pytest.fail("it runs"))
+    result = tune(recording, tmp_path / "out", *words)
+    assert result.exit_code == 2 and complaint in result.output and not (tmp_path / "out").exists()
