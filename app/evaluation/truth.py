@@ -169,6 +169,8 @@ def _times(path: Path, poses: int) -> I64:
     seconds = as_numbers(path, read_rows(path, layout), 1, layout)[:, 0]
     if len(seconds) != poses:
         raise HemislamError(f"{path} holds {len(seconds)} times for {poses} poses; there must be one per pose.")
+    if (np.abs(seconds) >= 2**63 * 1e-9).any():
+        raise HemislamError(f"{path} holds a time that is not in seconds; divide them all.")
     return np.rint(seconds * 1e9).astype(np.int64)
 
 

@@ -102,6 +102,7 @@ def test_kitti_poses_belong_to_frames_or_to_the_times_beside_them(tmp_path: Path
         (b"\xff\xfe\x00", "times.txt is not a text file; it holds one time per line"),
         (b"# s\n0.0 0\n0.1 1\n0.2 2\n", "line 2 has 2 columns, not 1"),
         (b"0.0\n0.1\n", "holds 2 times for 3 poses"),
+        (b"1700000000000000000\n1700000000100000000\n1700000000200000000\n", "not in seconds"),
     ],
 )
 def test_malformed_times_beside_kitti_poses_are_refused(tmp_path: Path, times: bytes, says: str) -> None:
