@@ -16,6 +16,8 @@ CLOUDS = (".ply", ".las", ".laz")
 """Suffixes of what can be read."""
 PIECE = 1_000_000
 """Points that are read at once."""
+_FARTHEST_M = 1e9
+"""No grid on Earth reaches that far."""
 _KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -39,7 +41,7 @@ def read_points(path: Path, thin: float, progress: Callable[[float], None] = lam
     voxels, taken = Voxels(thin), [np.empty((0, 3))]
     try:
         for share, points in read(path):
-            points = points[np.isfinite(points).all(axis=1)]
+            points = points[(np.abs(points) < _FARTHEST_M).all(axis=1)]  # nan neither
             taken.append(points[voxels.new(points)])
             progress(share)
     except OSError as error:

@@ -1,6 +1,7 @@
 """Maps of other programs are read, or refused in a sentence. Tests app/export/read_points.py."""
 
 import struct
+import warnings
 from pathlib import Path
 
 import laspy
@@ -76,3 +77,11 @@ def test_what_is_no_map_is_refused_in_a_sentence(name: str, content: bytes, word
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(HemislamError, match="gone"):
         read_points(tmp_path / "gone.ply", 0.05)
+
+
+def test_a_point_where_no_place_on_earth_is_does_not_count(tmp_path: Path) -> None:
+    points = np.array([[1.0, 2.0, 3.0], [1e30, 0.0, 0.0], [-np.inf, 0.0, 0.0]])
+    (tmp_path / "map.ply").write_bytes(ply("binary_little_endian", XYZ, points.tobytes(), count=3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_points(tmp_path / "map.ply", 0.05).tolist() == [[1.0, 2.0, 3.0]]
