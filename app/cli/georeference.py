@@ -91,6 +91,8 @@ def georeference(
         raise HemislamError("--factors and --out go together, for fixes.")
     if out is not None and out.resolve() == results.resolve():
         raise HemislamError("The bent map would replace the original; give --out another folder.")
+    if both := set(accept or []) & set(reject or []):
+        raise HemislamError(f"--accept and --reject both name fix {min(both)}; leave one of them out.")
     if (accept or reject) and control is not None:
         raise HemislamError("--accept and --reject are for fixes.")
     trajectory = read_tum(results / "trajectory.tum")

@@ -123,3 +123,9 @@ def test_a_map_is_not_bent_onto_itself(hemislam: Call, results: Path) -> None:
     files = ("--gnss", results / "fixes.csv", "--factors", "--force")
     outcome = hemislam("georeference", results, *files, "--out", results / "." / "")
     assert outcome.code == 2 and "give --out another folder" in outcome.err
+
+
+def test_a_fix_cannot_be_both_accepted_and_rejected(hemislam: Call, results: Path) -> None:
+    verdicts = ("--accept", 5, "--accept", 7, "--reject", 7)
+    outcome = hemislam("georeference", results, "--gnss", results / "fixes.csv", *verdicts)
+    assert outcome.code == 2 and "both name fix 7" in outcome.err
