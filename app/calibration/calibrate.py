@@ -28,6 +28,8 @@ ROUNDS = 3
 READING, ROUND = 0.1, 0.9 / (ROUNDS + 1)
 LARGEST_ROTATION, LARGEST_PLACE, LARGEST_OFFSET = np.radians(1.0), 0.05, 0.002
 """rad, m, s: values with a larger standard deviation count as not observable."""
+NOT_TURNED = np.radians(20.0)
+"""rad: where scans alone leave every axis of the rotation this open, the IMU would help in a wrong direction."""
 SURE = 3.0
 """Standard deviations by which two values must differ to be different."""
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1
@@ -195,8 +197,10 @@ def calibrate_excerpt(
         )
     turned = fit_rotation(way, inertial, first_rotation(way, inertial, late), late, given[0])
     guide = Guide.of(inertial, turned.R_imu_lidar, turned.late, turned.bias)
+    moved = fit_translation(way, inertial, turned, given[1])
     lines, seen = Lines.none(excerpt.lines), excerpt
-    for number in range(ROUNDS):
+    is_open = bool((np.diag(turned.covariance)[:3] > NOT_TURNED**2).all())
+    for number in range(0 if is_open else ROUNDS):
         way = track(seen, guide, report(number + 1))
         turned = fit_rotation(way, inertial, turned.R_imu_lidar, turned.late, given[0])
         moved = fit_translation(way, inertial, turned, given[1])

@@ -122,6 +122,8 @@ def _if(observed: bool, text: str) -> str:
 def _of_lines(lines: Lines) -> list[tuple[str, str]]:
     if not len(lines.ranges):
         return [("scan lines", "this LiDAR has none to calibrate")]
+    if np.isnan(lines.before).all():
+        return [("scan lines", WALK)]
     rows = []
     for k, (name, values, scale, unit) in enumerate(
         [("elevations", lines.elevations, np.degrees(1.0), "deg"), ("distances", lines.ranges, 1e3, "mm")]

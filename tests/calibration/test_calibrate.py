@@ -5,6 +5,7 @@ from a recording alone."""
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -28,6 +29,7 @@ from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.trajectory import read_tum
 from tests.calibration.rehearsal import MID360, TURN, known
+from tests.cli.conftest import write_walk
 from tests.sensors import rig
 
 
@@ -238,3 +240,17 @@ def test_errors_of_scan_lines_are_told_drawn_and_kept(tmp_path: Path) -> None:
     params = resolve_params(write_beside(tmp_path / "walk.mcap", found.found()).with_name("walk.mcap"), None, None, [])
     assert params.sensor.elevation_corrections == "0.2 -0.2 0.1 0"
     assert params.sensor.range_corrections == "0.01 -0.01 0.002 0"
+
+
+def test_a_walk_that_never_turns_is_tracked_once_and_gives_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor corrections of scan lines, which a rotation by chance would bring about."""
+    write_walk(tmp_path / "walk.mcap", duration_s=8.0, imu_until_s=8.0)
+    tracked = list[Any]()
+    monkeypatch.setattr("app.calibration.calibrate.track", lambda *call: tracked.append(call[1]) or track(*call))
+    found = calibrate(tmp_path / "walk.mcap", Params())
+    assert tracked == [None] and found.found() == {}
+    rows = dict(table(found))
+    assert rows["rotation of the LiDAR on the IMU"] == rows["scan lines"] == WALK
+    assert not any("nan" in text for text in rows.values())
