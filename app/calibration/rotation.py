@@ -115,7 +115,8 @@ def fit_rotation(track: Track, inertial: Inertial, R: F64, late: float, given: F
         spread = 1.48 * np.median(np.abs(off[kept])) + 1e-9
         root = (1.0 + (off[kept].ravel() / spread) ** 2) ** -0.25  # Barron's "soft L1"
         J = _jacobian(differences_kept, x).reshape(-1, 7)
-        step = np.linalg.lstsq(J * root[:, None], -off[kept].ravel() * root, rcond=None)[0]
+        rows = np.vstack([J * root[:, None], np.diag(spread / WIDEST)])  # else what nothing determines runs away
+        step = np.linalg.lstsq(rows, -np.append(off[kept].ravel() * root, spread / WIDEST * x), rcond=None)[0]
         x = x + step
         off = differences(x)
         if np.abs(step).max() < 1e-6:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from app.calibration.calibrate import NOT_TURNED
 from app.calibration.guide import Guide
 from app.calibration.inertial import Inertial, Noise
 from app.calibration.odometry import Track
@@ -105,6 +106,14 @@ def test_turning_about_one_axis_leaves_the_rotation_about_it_unknown() -> None:
     track, inertial = sensed(hand(30.0, (0.5, 0.0, 0.0)), np.eye(3), 0.0)
     found = turned_by(track, inertial)
     assert np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])) > 1.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_without_turning_the_bias_of_the_gyroscope_is_known_all_the_same(seed: int) -> None:
+    R = Rotation.random(random_state=seed).as_matrix()
+    found = turned_by(*sensed(hand(8.0, (0.0, 0.0, 0.0), seed), R, 0.0, seconds=8.0, seed=seed))
+    assert np.abs(found.bias - GYRO_BIAS).max() < 0.01 and abs(found.late) < 0.6
+    assert (np.sqrt(np.diag(found.covariance)[:3]) > NOT_TURNED).all()
 
 
 def test_a_lively_motion_shows_the_place_of_the_lidar_to_a_centimetre() -> None:
