@@ -77,6 +77,11 @@ def test_the_transport_lies_along_the_scene_and_what_was_unfolded_stays_so_after
     assert inside is not None and outside is not None
     assert inside["width"] > 0.9 * outside["width"]
     assert 0 <= outside["y"] + outside["height"] - inside["y"] - inside["height"] < 20
+    bench.eventually(lambda: timeline(bench).count() == 1)
+    if timeline(bench).is_hidden():  # alone
+        page.get_by_role("button", name="Diagnostics").click()
+        bench.engine.send(StepFrame(120))
+        bench.eventually(lambda: drawn(bench) > 300)
     page.reload()
     bench.eventually(lambda: timeline(bench).count() == 1 and drawn(bench) > 300)
     click_goes_to(bench, 20)
@@ -142,6 +147,7 @@ def pixel_of(bench: Bench, index: int) -> tuple[float, float]:
 
 
 def test_a_clicked_point_shows_its_numbers_until_another_frame_comes(bench: Bench) -> None:
+    bench.engine.send(StepFrame())
     bench.look((-4.0, -4.0, 9.0), (0.3, 0.2, -0.6))
     bench.page.get_by_role("tab", name="Study").click()
     asks = bench.page.get_by_text("Pause and click a point")
@@ -159,6 +165,8 @@ def test_a_clicked_point_shows_its_numbers_until_another_frame_comes(bench: Benc
 
 
 def test_a_frame_is_downloaded(bench: Bench, tmp_path: Path) -> None:
+    bench.engine.send(StepFrame())
+    bench.page.get_by_role("tab", name="Study").click()
     with bench.page.expect_download() as download:
         bench.page.get_by_role("button", name="PLY").click()
     download.value.save_as(tmp_path / "frame.ply")
