@@ -11,8 +11,8 @@ from app.slam.params import Params
 
 POINT_BUDGET = 3_000_000
 """Most map points that a page draws."""
-HELD = 4
-"""The server holds this many times as many, 300 MB, so that each page can show in detail what it looks at."""
+HELD = 3
+"""The server holds this many times as many, 220 MB, so that each page can show in detail what it looks at."""
 
 
 @dataclass(frozen=True, slots=True)
