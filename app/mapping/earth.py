@@ -15,6 +15,7 @@ from app.georeference.fixes import Fixes
 from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.survey import Survey
 from app.georeference.tables import read_fixes
+from app.mapping.kept import is_there
 from app.sensors.navsat import recorded_fixes
 from app.slam import lie
 from app.slam.errors import HemislamError
@@ -97,11 +98,8 @@ def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool])
     table = control_table(survey.control)
     picked = {}
     for pick in survey.picks:
-        if not 0 <= pick.keyframe < len(results.keyframes):
-            continue
-        keyframe = results.keyframes[pick.keyframe]
-        if pick.frame in (-1, keyframe.frame):
-            T = results.frame.at(pick.keyframe) @ keyframe.T_odom_imu
+        if is_there(pick, results.keyframes):
+            T = results.frame.at(pick.keyframe) @ results.keyframes[pick.keyframe].T_odom_imu
             picked[pick.name] = lie.moved(T, pick.at)
     return align_with_points(table, picked, grid=survey.crs, height=survey.height or ELLIPSOIDAL, overridden=overridden)
 

@@ -6,9 +6,11 @@ from typing import Annotated, Any
 from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 from app.export.box import Box
+from app.georeference.survey import Pick
 from app.mapping.painted import Stroke, entry_of, stroke_of
 from app.slam.arrays import Vector
 from app.slam.errors import HemislamError
+from app.slam.ply import Keyframes
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +37,11 @@ class Spot:
     keyframe: int
     at: Vector
     frame: int = -1
+
+
+def is_there(spot: Spot | Pick, keyframes: Keyframes) -> bool:
+    """Whether the keyframe that it was picked on is still there, and no other one in its place."""
+    return 0 <= spot.keyframe < len(keyframes) and spot.frame in (-1, keyframes[spot.keyframe].frame)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import Any
 from app.export.exports import BY_RUN, of_formats, save_results
 from app.export.results import Results
 from app.georeference.survey import Survey
-from app.mapping.kept import Kept, Spot
+from app.mapping.kept import Kept, is_there
 from app.mapping.session_file import SUFFIX, SavedSession, write_session
 from app.slam.loops.edits import LoopEdit
 
@@ -37,14 +37,9 @@ def write_all(
 
 def mark(results: Results, kept: Kept) -> None:
     """Add the measures and notes, which some files show."""
-
-    def held(spot: Spot) -> bool:
-        there = 0 <= spot.keyframe < len(results.keyframes)
-        return there and spot.frame in (-1, results.keyframes[spot.keyframe].frame)
-
     results.marks = tuple(
         (one.name, tuple((spot.keyframe, spot.at) for spot in one.spots))
         for one in kept.measures
-        if all(map(held, one.spots))
+        if all(is_there(spot, results.keyframes) for spot in one.spots)
     )
     results.notes = tuple((note.frame, note.text) for note in kept.notes)

@@ -306,7 +306,7 @@ class Controller:
         self._take(session)
 
     def _reopen(self) -> None:
-        """Begin again with the present parameters. Notes, kept views, measures, painted labels and loop edits stay."""
+        """Begin again with the present parameters. What the user made stays; loop edits only for the same keyframes."""
         before, kept = self._need_session(), self._kept
         self._of_before = 0
         info, edits = before.feed.info, before.edits

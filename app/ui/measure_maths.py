@@ -91,10 +91,10 @@ def meet(
 
 
 def places(measure: Measure, poses: F64, frames: Mapping[int, int] = MappingProxyType({})) -> F64 | None:
-    """(1 to 3, 3) m, its spots in the map; None where a keyframe is not there, as after going back, or is another one.
+    """(1 to 3, 3) m, its spots in the map. None: after going back or with other settings, one's keyframe is not there.
 
     Args:
-        poses: (k, 4, 4) T_map_imu of the keyframes. frames: of keyframes, by their index.
+        poses: (k, 4, 4) T_map_imu of the keyframes. frames: of keyframes, by their index, as far as they are known.
     """
     for spot in measure.spots:
         other = spot.frame not in (-1, frames.get(spot.keyframe, spot.frame))

@@ -46,9 +46,7 @@ MOST_AHEAD: Final = 8
 """Questions without an answer at which frames wait all the same, so that keyframes do not pile up in memory."""
 STATES: Final = 512
 """States that are kept, so that going back need not solve the graph again."""
-LEFT_OUT: Final = (
-    "Edits of loops are left out: other settings choose other keyframes, so the loops that they name are others now."
-)
+LEFT_OUT: Final = "Edits of loops are left out: with the new settings they would change loops of other keyframes."
 
 
 @dataclass(frozen=True, slots=True, order=True)
