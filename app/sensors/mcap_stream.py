@@ -3,21 +3,22 @@ it would mix up, since it sorts by log time and the recorder's clock was set bac
 """
 
 import struct
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from app.sensors.log_times import LATEST_NS, SET_BACK_NS, mended
 from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type
 from app.sensors.unpacking import LIMIT, UNPACK, TooLarge
 from app.slam.errors import printable
-
-SET_BACK_NS = 500_000_000
-"""Log times on one topic that step back by more do so because the recorder's clock was set."""
 
 
 class McapStream:
@@ -28,6 +29,8 @@ class McapStream:
         cut: the pieces without an end, in order of time.
         set_back: (number of a message, ns): where the recorder's clock was set back, and by how much. From there on
             this is added to log times, so that they go on.
+        sorted: whether log times never step back, not even by a little.
+        wild: how many messages have log times far from those around them; better ones are given for these.
     """
 
     by_log_time = False
@@ -41,8 +44,16 @@ class McapStream:
         self._pieces = sorted(pieces, key=self._begin)
         first_ns, last_ns, added_ns = 0, 0, 0
         last: dict[str, int] = {}
-        for number, (topic, kind, log_ns, _, _) in enumerate(self._all_records()):
+        topics, times = list[str](), array("q")
+        for topic, kind, log_ns, _, _ in self._all_records():
             self.counts[topic] = (kind, self.counts.get(topic, (kind, 0))[1] + 1)
+            topics.append(topic)
+            times.append(log_ns)
+        self._better = mended(np.array(times, np.int64))
+        self.wild = len(self._better)
+        self.sorted = all(before <= after for before, after in pairwise(times))
+        for number, topic in enumerate(topics):
+            log_ns = self._better.get(number, times[number])
             if log_ns + added_ns < last.get(topic, log_ns + added_ns) - SET_BACK_NS:
                 self.set_back.append((number, last_ns + 1 - log_ns - added_ns))
                 added_ns += self.set_back[-1][1]
@@ -61,6 +72,7 @@ class McapStream:
         added_ns, set_back = 0, dict(self.set_back)
         for number, (topic, kind, log_ns, encoding, data) in enumerate(self._all_records()):
             added_ns += set_back.get(number, 0)
+            log_ns = self._better.get(number, log_ns)
             if topic in topics and start_ns <= log_ns + added_ns < stop_ns:
                 yield topic, log_ns + added_ns, self._deserialiser.read(data, kind, encoding)
         if self._pieces[-1] in self.cut and stop_ns > self.end_ns:
@@ -70,8 +82,9 @@ class McapStream:
         """Nothing stays open between two readings."""
 
     def _begin(self, piece: Path) -> int:
-        """Log time of its first message; 0 without any."""
-        return next((log_ns for _, _, log_ns, _, _ in self._records_of(piece)), 0)
+        """Log time of one of its first messages; 0 without any."""
+        first = sorted(log_ns for _, _, log_ns, _, _ in islice(self._records_of(piece), 5))
+        return first[len(first) // 2] if first else 0
 
     def _all_records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
         for piece in self._pieces:
@@ -93,7 +106,7 @@ class McapStream:
                         self._deserialiser.learn(kind, schema.data.decode(errors="replace") if schema else "", encoding)
                     elif isinstance(record, Message) and record.channel_id in channels:
                         topic, kind, encoding = channels[record.channel_id]
-                        yield topic, kind, record.log_time, encoding, record.data
+                        yield topic, kind, min(record.log_time, LATEST_NS), encoding, record.data
             except (EndOfFile, McapError, struct.error):  # the last of a record that is cut in its middle
                 if piece not in self.cut:
                     self.cut.append(piece)

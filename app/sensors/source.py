@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,7 +16,8 @@ from app.sensors.findings import Finding
 from app.sensors.live.capture import SUFFIXES as CAPTURES
 from app.sensors.live.capture import CaptureStream
 from app.sensors.live.pcap import CaptureError
-from app.sensors.mcap_stream import SET_BACK_NS, McapStream
+from app.sensors.log_times import LATEST_NS, may_be_disordered, of_messages, sound_span
+from app.sensors.mcap_stream import McapStream
 from app.sensors.ouster import OusterStream, metadata_beside
 from app.sensors.ros import Deserialiser
 from app.sensors.unpacking import limit_rosbags
@@ -34,7 +35,6 @@ _REPAIR = {
     "": "`ros2 bag reindex {path}` may repair it",
 }
 _KINDS = "a ROS 1 .bag, a ROS 2 folder, an .mcap, a .db3, or a .pcap of an RS-Bpearl, an Airy, a Mid-360 or an Ouster"
-_FOREVER = 2**63 - 1
 LOG_MARGIN_NS = 2_000_000_000
 """A message logged this much later or earlier than usual is still found by its time."""
 
@@ -82,25 +82,19 @@ class RosbagsStream:
             topic = printable(connection.topic)
             _, before = self.counts.get(topic, ("", 0))
             self.counts[topic] = (printable(connection.msgtype), before + connection.msgcount)
-        self.start_ns, self.end_ns = int(self._reader.start_time), int(self._reader.end_time)
+        self.start_ns, self.end_ns = min(self._reader.start_time, LATEST_NS), min(self._reader.end_time, LATEST_NS)
+        self.disordered, self.wild = may_be_disordered(self._reader.readers), 0
+        if len(times := of_messages(self._reader.readers)):
+            self.start_ns, self.end_ns, self.wild = sound_span(times)
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
+        if self.wild:
+            start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns)
         connections = [one for one in self._reader.connections if printable(one.topic) in topics]
         if not connections:  # which rosbags would take for all of them
             return
         for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
             yield printable(connection.topic), log_ns, self._deserialised(raw, connection.msgtype)
-
-    def may_be_set_back(self) -> bool:
-        """Whether an MCAP's chunks step back in time, as where the recorder's clock was set."""
-        for reader in self._reader.readers:
-            storages = getattr(storage := getattr(reader, "storage", None), "storages", [storage])
-            for chunks in (getattr(storage, "chunks", []) for storage in storages):
-                for before, after in pairwise(sorted(chunks, key=lambda chunk: chunk.chunk_start_offset)):
-                    shared = before.message_index_offsets.keys() & after.message_index_offsets.keys()
-                    if shared and after.message_start_time < before.message_end_time - SET_BACK_NS:
-                        return True
-        return False
 
     def close(self) -> None:
         self._reader.close()
@@ -123,7 +117,7 @@ class RosbagsStream:
 
 Stream = RosbagsStream | McapStream | CaptureStream | OusterStream
 """One kind of file, opened. `counts`: topic -> (type, number of messages). `start_ns`, `end_ns`: log times of the first
-and last message. `by_log_time`: whether messages come sorted by log time."""
+and last message. `by_log_time`: whether messages come sorted by log time. `wild`: of how many they are wrong."""
 
 
 class Source(AbstractContextManager["Source"]):
@@ -149,6 +143,11 @@ class Source(AbstractContextManager["Source"]):
         if not any(topic.messages for topic in self.topics):
             self.close()
             raise HemislamError(f"{path} is a recording without a single message; record it again.")
+        if self._stream.wild:
+            what = "left out" if self._stream.by_log_time else "read as if logged with those before them"
+            messages = sum(topic.messages for topic in self.topics)
+            text = f"far from all others for {self._stream.wild} of {messages} messages, which are {what}"
+            self.findings += (Finding("log times", "corrected", text),)
 
     def messages(
         self,
@@ -165,7 +164,7 @@ class Source(AbstractContextManager["Source"]):
         Raises:
             HemislamError: the file is damaged here; everything before was given.
         """
-        first, stop = start_ns or 0, _FOREVER if stop_ns is None else stop_ns
+        first, stop = start_ns or 0, LATEST_NS + 1 if stop_ns is None else stop_ns
         known = 0
         if after is not None:
             known, first = (after.at_log_ns, after.log_ns) if self._stream.by_log_time else (after.read, first)
@@ -210,10 +209,10 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         if salvaged is None:
             raise HemislamError(_refusal(path, error)) from error
         return salvaged
-    if reader.may_be_set_back() and (in_order := _in_file_order(path, files)):
+    if reader.disordered and (in_order := _in_file_order(path, files)):
         reader.close()
-        text = "read in the order of the file, since the recorder's clock was set back on the way"
-        return in_order, (Finding("file", "corrected", text),)
+        why = "the recorder's clock was set back on the way" if in_order.set_back else "log times in it are wrong"
+        return in_order, (Finding("file", "corrected", f"read in the order of the file, since {why}"),)
     if unmerged := [wal for file in files for wal in _write_ahead_logs(file)]:
         database = str(unmerged[0]).removesuffix("-wal")
         text = (
@@ -251,12 +250,12 @@ def _write_ahead_logs(path: Path) -> list[Path]:
 
 
 def _in_file_order(path: Path, files: list[Path]) -> McapStream | None:
-    """The files of an MCAP read from front to back, if the recorder's clock was set back on the way."""
+    """The files of an MCAP read from front to back, if log times are wrong or step back on the way."""
     try:
         stream = McapStream(sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files)
     except Exception:  # whatever a damaged file may cause; rosbags reads it
         return None
-    return stream if stream.set_back else None
+    return None if stream.sorted and not stream.wild else stream
 
 
 def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Finding, ...]] | None:

@@ -65,7 +65,7 @@ class PacketStream(ABC):
         complete: whether the file has its end. findings: what the packets are, and what was lost of them.
     """
 
-    by_log_time = True
+    by_log_time, wild = True, 0
     counts: dict[str, tuple[str, int]]
     findings: tuple[Finding, ...]
 
