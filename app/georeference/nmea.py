@@ -27,8 +27,9 @@ class _Log:
         walk_ns: the time of the walk: of two dates that contradict each other without a pause, the nearer one counts.
         near_ns: a time within half a day, for sentences without a date; at first that of the walk.
         places: latitude and longitude in degrees, height above the geoid and the geoid's above the ellipsoid (nan if
-            not told), m. stamps, at: of each place, in ns and in s of the day.
-        sigmas: m to the east, north and up by s of the day.
+            not told), m. stamps: of each place, in ns.
+        sigmas: of each place, m to the east, north and up. told: those of the day's GST, by s of the day.
+        untold: by s of the day, the places without sigmas so far. now: s of the day; if it steps back, a day begins.
         fixed: the last GGA or RMC has a fix; None before the first. Without one, the date of ZDA may be that of the
             receiver's own clock.
         early: day and s of it, by the last ZDA before the first GGA or RMC, which says whether it counts.
@@ -39,8 +40,10 @@ class _Log:
     near_ns: int
     places: list[tuple[float, float, float, float]] = field(default_factory=list)
     stamps: list[int] = field(default_factory=list)
-    at: list[float] = field(default_factory=list)
-    sigmas: dict[float, tuple[float, float, float]] = field(default_factory=dict)
+    sigmas: list[tuple[float, float, float]] = field(default_factory=list)
+    told: dict[float, tuple[float, float, float]] = field(default_factory=dict)
+    untold: dict[float, int] = field(default_factory=dict)
+    now: float = 0.0
     fixed: bool | None = None
     early: tuple[datetime, float] | None = None
     begin: int = 0
@@ -59,7 +62,10 @@ class _Log:
                     self._place(words)
             elif kind.endswith("GST") and len(words) > 7 and words[5]:
                 north, east, up = (float(word) for word in words[5:8])
-                self.sigmas[_seconds(words[0])] = east, north, up
+                at = self._at(words[0])
+                self.told[at] = east, north, up
+                if at in self.untold:
+                    self.sigmas[self.untold.pop(at)] = self.told[at]
             elif kind.endswith("RMC") and len(words) > 8:
                 self._set_fixed(words[1] == "A")
                 if self.fixed and words[8]:
@@ -80,11 +86,21 @@ class _Log:
 
     def _place(self, words: list[str]) -> None:
         latitude, longitude = _degrees(words[1], words[2]), _degrees(words[3], words[4])
-        at = _seconds(words[0])
+        at = self._at(words[0])
         self.near_ns = self._guessed(at)
         self.places.append((latitude, longitude, float(words[8]), float(words[10] or "nan")))
         self.stamps.append(self.near_ns)
-        self.at.append(at)
+        self.sigmas.append(self.told.get(at, _NOBODY))
+        if self.sigmas[-1] is _NOBODY:
+            self.untold[at] = len(self.sigmas) - 1
+
+    def _at(self, text: str) -> float:
+        """The s of the day of a place or its sigmas."""
+        before, self.now = self.now, _seconds(text)
+        if self.now < before - _PAUSE_NS / 1e9:
+            self.told.clear()
+            self.untold.clear()
+        return self.now
 
     def _day(self, day: datetime, at_s: float) -> None:
         if day.year not in _YEARS:
@@ -119,7 +135,7 @@ def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
     *place, height, separation = np.array(log.places).T
     ellipsoidal = bool(np.isfinite(separation).all())  # if it is missing once, all heights are left above the geoid
     places = np.column_stack([*place, height + separation if ellipsoidal else height])
-    return Fixes.of(log.stamps, places, [log.sigmas.get(at, _NOBODY) for at in log.at]), ellipsoidal
+    return Fixes.of(log.stamps, places, log.sigmas), ellipsoidal
 
 
 def _degrees(text: str, side: str) -> float:

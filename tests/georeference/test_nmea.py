@@ -1,5 +1,7 @@
 """Sentences of a receiver. Oracle: the example that every description of NMEA quotes."""
 
+import math
+
 import pytest
 
 from app.georeference import nmea
@@ -78,6 +80,20 @@ def test_a_sentence_that_cannot_be_is_ignored_though_its_checksum_is_right(absur
 def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
     fixes, _ = nmea.read([GGA, sentence("GPGST,123519,0.006,0.023,0.020,273.6,0.023,0.020,0.031")], "log", 0)
     assert fixes.sigmas[0].tolist() == [0.020, 0.023, 0.031]  # GST names north first
+
+
+@pytest.mark.parametrize("gst_first", [False, True])
+def test_sigmas_are_those_of_the_same_day(gst_first: bool) -> None:
+    """A log that was left on over days has each time of the day again, and some without a fix or without sigmas."""
+    lines, order = [], -1 if gst_first else 1
+    for day, sigma in ((19, 0.5), (20, None), (21, 0.01), (22, 0.02)):
+        lines.append(sentence(f"GPZDA,123518.00,{day},03,1994,00,00"))
+        lines += [GGA, sentence(f"GPGST,123519,1,1,1,0,{sigma},{sigma},{sigma}")][::order] if sigma else [GGA]
+        lines.append(sentence(GGA[1:-3].replace("123519", "133519")))
+    fixes, _ = nmea.read(lines, "log", 764_426_119 * 10**9)
+    assert fixes.sigmas[:, 0].tolist() == pytest.approx(
+        [0.5, *[math.nan] * 3, 0.01, math.nan, 0.02, math.nan], nan_ok=True
+    )
 
 
 def test_heights_of_one_log_are_all_above_the_same_surface() -> None:
