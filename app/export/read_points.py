@@ -1,6 +1,7 @@
 """Points of maps that this program or others have written: PLY, LAS and LAZ, read piece by piece and thinned."""
 
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -66,7 +67,11 @@ def _ply(path: Path) -> Iterator[tuple[float, F64]]:
         order, vertex, count = _header(file)
         for begin in range(0, count, PIECE):
             size = min(PIECE, count - begin)
-            rows = np.fromfile(file, vertex, size) if order else np.loadtxt(file, vertex, max_rows=size, ndmin=1)
+            if order:
+                rows = np.fromfile(file, vertex, size)
+            else:
+                lines = list(islice(filter(bytes.strip, file), size))
+                rows = np.loadtxt(lines, vertex, comments=None, ndmin=1) if lines else np.empty(0, vertex)
             if len(rows) < size:
                 raise ValueError("it ends too early")
             yield (begin + size) / count, np.column_stack([rows[axis] for axis in "xyz"]).astype(np.float64)

@@ -63,11 +63,15 @@ def test_of_points_closer_than_wished_the_first_is_taken(tmp_path: Path) -> None
         ("map.ply", ply("binary_little_endian", "property double x\n", bytes(24)), "no field"),
         ("map.ply", ply("binary_little_endian", XYZ, bytes(24), count=-1), "no points"),
         ("map.ply", ply("binary_little_endian", XYZ, np.full(9, np.nan).tobytes()), "no points"),
+        ("map.ply", ply("ascii", XYZ, b"", count=3), "ends too early"),
+        ("map.ply", ply("ascii", XYZ, b"1 2 3\n\n", count=3), "ends too early"),
+        ("map.ply", ply("ascii", XYZ, b"1 2 3\n1 2 #\n", count=2), "damaged"),
         ("map.laz", b"LASF" + bytes(400), "damaged"),
         ("map.las", b"", "damaged"),
         ("map.xyz", b"1 2 3", "choose a file"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_what_is_no_map_is_refused_in_a_sentence(name: str, content: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(HemislamError, match=words):
