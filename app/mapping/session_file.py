@@ -45,6 +45,7 @@ from app.slam.loops import edit_files
 from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
 from app.slam.text_files import free_path, make_folder, shortened, write_texts
+from app.slam.user_text import read_text
 
 log = logging.getLogger(__name__)
 
@@ -309,14 +310,10 @@ def read_marks(path: Path) -> tuple[tuple[int, bytes], ...]:
     Raises:
         HemislamError: it cannot be read, or holds none.
     """
-    try:
-        strokes = (
-            read_session(path).state.painted
-            if path.suffix == SUFFIX
-            else read_json(path.read_text(encoding="utf-8"), path.name)
-        )
-    except (OSError, UnicodeDecodeError) as error:
-        raise HemislamError(f"The labels {path} cannot be read: {error}.") from None
+    if path.suffix == SUFFIX:
+        strokes = read_session(path).state.painted
+    else:
+        strokes = read_json(read_text(path, "give NAME.labels.json, as the page saves it"), path.name)
     if not (found := marks(strokes)):
         raise HemislamError(f"{path} holds no labelled points; label some frames under Study first.")
     return tuple((stamp, labels.tobytes()) for stamp, labels in found.items())

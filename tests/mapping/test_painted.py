@@ -95,3 +95,12 @@ def test_a_session_file_keeps_the_strokes_and_a_search_reads_their_marks(tmp_pat
     write_session(path, replace(saved, state=State(Params())))
     with pytest.raises(HemislamError, match="no labelled points"):
         read_marks(path)
+
+
+@pytest.mark.parametrize("name", ["", "gone.labels.json", "gone.hemislam", "bytes.labels.json"])
+def test_labels_that_cannot_be_read_are_named_in_a_sentence(name: str, tmp_path: Path) -> None:
+    (tmp_path / "bytes.labels.json").write_bytes(b"\xff\xfe")
+    with pytest.raises(HemislamError) as refused:
+        read_marks(tmp_path / name)
+    assert str(tmp_path / name) in str(refused.value) and "Errno" not in str(refused.value)
+    assert "codec" not in str(refused.value)
