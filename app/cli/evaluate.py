@@ -144,6 +144,8 @@ def evaluate(
     if not paths:
         raise HemislamError("Nothing to evaluate; name a RECORDING or use --suite paper.")
     subjects = read_subjects(paths, params_for, truths or [], _lever(lever))
+    if lever is not None and all(subject.truth is None for subject in subjects):
+        raise HemislamError("--lever belongs to a truth, and no recording has one; add --truth, or leave it out.")
     others = _compared(compare or [], [subject.name for subject in subjects], [variant.name for variant in chosen])
     subjects = [replace(subject, compared=tuple(others[subject.name])) for subject in subjects]
     for variant in chosen:
