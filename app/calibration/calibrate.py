@@ -193,7 +193,7 @@ def calibrate_excerpt(
     if is_mirrored(way, inertial, late):
         raise MirroredError(
             f"The gyroscope in {path} turns as the LiDAR does in a mirror: one of its axes has the wrong sign, or two "
-            "are exchanged; correct the driver, or try --set recording.gyroscope_axes=-xyz, x-yz or xy-z."
+            "are exchanged; correct the driver, or set recording.gyroscope_axes to -xyz, x-yz or xy-z."
         )
     turned = fit_rotation(way, inertial, first_rotation(way, inertial, late), late, given[0])
     guide = Guide.of(inertial, turned.R_imu_lidar, turned.late, turned.bias)

@@ -99,7 +99,9 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
     """
     if text.startswith("topic:"):
         if recording is None:
-            raise HemislamError(f"`--truth {text}` names a topic, but there is no recording to read it from.")
+            raise HemislamError(
+                f"`{text}` names a topic, but there is no recording to read it from; give a file of poses."
+            )
         truth = _read_topic(recording, text.removeprefix("topic:"))
     else:
         truth = _read_file(Path(text))

@@ -179,7 +179,8 @@ def results_folder(folder: Path, *, replace: bool = False) -> Iterator[None]:
     held = [export.name for export in BY_RUN if (folder / export.name).exists()]
     if held and not replace:
         raise HemislamError(
-            f"{folder} already holds results ({', '.join(held)}); choose another folder or add --force."
+            f"{folder} already holds results ({', '.join(held)}); choose another folder, or add --force on the command"
+            " line to replace them."
         )
     if not os.access(folder, os.W_OK | os.X_OK):
         raise HemislamError(f"The folder {folder} is not writable; choose another one.")

@@ -65,12 +65,12 @@ def choose_objectives(names: Sequence[str], subjects: "Sequence[Subject]") -> tu
         if objective is None:
             raise HemislamError(f"There is no objective {name}; choose from {', '.join(OBJECTIVES)}.")
         if objective in chosen:
-            raise HemislamError(f"--objective names {name} twice.")
+            raise HemislamError(f"The objective {name} is named twice; name it once.")
         without = [subject.name for subject in subjects if subject.truth is None]
         if objective.needs_truth and without:
             raise HemislamError(
-                f"The objective {name} needs true poses, and {without[0]} has none; give --truth FILE,"
-                " or choose an objective that needs none, such as entropy."
+                f"The objective {name} needs true poses, and {without[0]} has none; give some (--truth on the"
+                " command line), or choose an objective that needs none, such as entropy."
             )
         chosen.append(objective)
     return tuple(chosen)

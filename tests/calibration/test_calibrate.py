@@ -70,7 +70,7 @@ def test_a_mounting_of_a_preset_counts_for_the_imu_inside_only(tmp_path: Path) -
 
 def test_a_mirrored_gyroscope_is_named_instead_of_a_mounting(excerpt: Excerpt) -> None:
     imu = replace(excerpt.imu, gyro=excerpt.imu.gyro * [1.0, -1.0, 1.0])
-    with pytest.raises(MirroredError, match=r"in a mirror: .*gyroscope_axes=-xyz, x-yz or xy-z"):
+    with pytest.raises(MirroredError, match=r"in a mirror: .*gyroscope_axes to -xyz, x-yz or xy-z"):
         calibrate_excerpt(Path("walk.mcap"), Params(), Excerpt(excerpt.scans, imu))
 
 

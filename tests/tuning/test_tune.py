@@ -254,8 +254,9 @@ def test_a_search_for_the_page_shows_each_run_and_its_trials_and_leaves_the_same
 
 def test_a_search_for_the_page_that_cannot_be_says_why(recording: Path, tmp_path: Path) -> None:
     owner = Owner()
-    with pytest.raises(HemislamError, match="needs true poses"):
-        find(owner, wanted(recording, tmp_path, "ate"))  # type: ignore[arg-type]
+    for objectives, why in ((("ate",), "needs true poses"), (("entropy", "entropy"), "named twice")):
+        with pytest.raises(HemislamError, match=why):
+            find(owner, replace(wanted(recording, tmp_path, "ate"), objectives=objectives))  # type: ignore[arg-type]
     assert not owner.told
 
 
