@@ -1,9 +1,5 @@
 """Log times of a file that step back, or are far from those around them, as a bit that was turned makes them."""
 
-from collections.abc import Iterator, Sequence
-from itertools import chain, pairwise
-from typing import Any
-
 import numpy as np
 
 from app.slam.types import I64
@@ -47,36 +43,3 @@ def mended(times: I64) -> dict[int, int]:
     for number, instead in zip(near[wild].tolist(), middle[wild].tolist(), strict=True):
         better[number] = better.get(number - 1, int(times[number - 1])) if number else int(instead)
     return better
-
-
-def of_messages(readers: Sequence[Any]) -> I64:
-    """Log times of all messages of the bags and databases that rosbags has opened."""
-    bags = chain.from_iterable(getattr(reader, "indexes", {}).values() for reader in readers)
-    times = [np.array([entry.time for entry in index], np.int64) for index in bags]
-    for storage in _storages(readers):
-        if (database := getattr(storage, "dbconn", None)) is not None:
-            rows = database.execute("SELECT CAST(timestamp AS INTEGER) FROM messages")
-            times.append(np.fromiter(chain.from_iterable(rows), np.int64))
-    return np.concatenate([np.empty(0, np.int64), *times])
-
-
-def may_be_disordered(readers: Sequence[Any]) -> bool:
-    """Whether chunks of an MCAP that rosbags has opened step back in time, last too long, or are few and far away;
-    or whether there are none."""
-    for chunks in (storage.chunks for storage in _storages(readers) if hasattr(storage, "chunks")):
-        if not chunks or any(chunk.message_end_time - chunk.message_start_time > FAR_NS for chunk in chunks):
-            return True
-        for before, after in pairwise(sorted(chunks, key=lambda chunk: chunk.chunk_start_offset)):
-            back_ns = before.message_end_time - after.message_start_time
-            shared = before.message_index_offsets.keys() & after.message_index_offsets.keys()
-            few = min(sum(chunk.channel_count.values()) for chunk in (before, after)) <= FEW
-            if back_ns > (SET_BACK_NS if shared else FAR_NS) or (few and -back_ns > FAR_NS):
-                return True
-    return False
-
-
-def _storages(readers: Sequence[Any]) -> Iterator[Any]:
-    """Those of ROS 2."""
-    for reader in readers:
-        storage = getattr(reader, "storage", None)
-        yield from getattr(storage, "storages", [storage])

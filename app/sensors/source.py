@@ -2,26 +2,21 @@
 
 import re
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
-
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
 from app.sensors.findings import Finding
 from app.sensors.live.capture import SUFFIXES as CAPTURES
 from app.sensors.live.capture import CaptureStream
 from app.sensors.live.pcap import CaptureError
-from app.sensors.log_times import LATEST_NS, may_be_disordered, of_messages, sound_span
+from app.sensors.log_times import LATEST_NS
 from app.sensors.mcap_stream import McapStream
 from app.sensors.ouster import OusterStream, metadata_beside
-from app.sensors.ros import Deserialiser
-from app.sensors.unpacking import limit_rosbags
-from app.slam.errors import HemislamError, printable, quoted
+from app.sensors.rosbags_stream import RosbagsStream
+from app.slam.errors import HemislamError, quoted
 from app.slam.text_files import is_file
 
 _COMPRESSED = (".zst", ".zstd")
@@ -62,57 +57,6 @@ class Mark:
         if mark is None:
             return cls(1, log_ns, 1)
         return cls(mark.read + 1, log_ns, mark.at_log_ns + 1 if mark.log_ns == log_ns else 1)
-
-
-class RosbagsStream:
-    """What the rosbags library reads: a ROS 1 bag, a ROS 2 folder or single file. See `Stream`."""
-
-    by_log_time = True
-
-    def __init__(self, files: list[Path]) -> None:
-        """Raises whatever the library raises for a file that it cannot read."""
-        limit_rosbags()
-        self._links = TemporaryDirectory()  # of names that end as rosbags expects
-        files = [self._in_small_letters(path) for path in files]
-        self._standard = Deserialiser()
-        self._reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        self._reader.open()
-        self.counts: dict[str, tuple[str, int]] = {}
-        for connection in self._reader.connections:
-            topic = printable(connection.topic)
-            _, before = self.counts.get(topic, ("", 0))
-            self.counts[topic] = (printable(connection.msgtype), before + connection.msgcount)
-        self.start_ns, self.end_ns = min(self._reader.start_time, LATEST_NS), min(self._reader.end_time, LATEST_NS)
-        self.disordered, self.wild = may_be_disordered(self._reader.readers), 0
-        if len(times := of_messages(self._reader.readers)):
-            self.start_ns, self.end_ns, self.wild = sound_span(times)
-
-    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
-        if self.wild:
-            start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns)
-        connections = [one for one in self._reader.connections if printable(one.topic) in topics]
-        if not connections:  # which rosbags would take for all of them
-            return
-        for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
-            yield printable(connection.topic), log_ns, self._deserialised(raw, connection.msgtype)
-
-    def close(self) -> None:
-        self._reader.close()
-        self._links.cleanup()
-
-    def _deserialised(self, raw: bytes, kind: str) -> Any:
-        """Read standard types as they are defined, whatever the file states about them."""
-        encoding = "cdr" if self._reader.is2 else "ros1"
-        if self._standard.knows(kind, encoding):
-            return self._standard.read(raw, kind, encoding)
-        return self._reader.deserialize(raw, kind)
-
-    def _in_small_letters(self, path: Path) -> Path:
-        if path.suffix == path.suffix.lower():
-            return path
-        link = Path(self._links.name) / path.with_suffix(path.suffix.lower()).name
-        link.symlink_to(path.resolve())
-        return link
 
 
 Stream = RosbagsStream | McapStream | CaptureStream | OusterStream
@@ -203,29 +147,48 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         capture = _open_capture(path)
         return capture, capture.findings
     try:
-        reader = RosbagsStream(files)
+        reader, found = _read_by_rosbags(path, files)
     except Exception as error:  # as above
         salvaged = _salvage(path, files, _brief(error))
         if salvaged is None:
             raise HemislamError(_refusal(path, error)) from error
         return salvaged
-    if reader.disordered and (in_order := _in_file_order(path, files)):
+    if reader.may_be_disordered() and (in_order := _in_file_order(path, files)):
         reader.close()
         why = "the recorder's clock was set back on the way" if in_order.set_back else "log times in it are wrong"
-        return in_order, (Finding("file", "corrected", f"read in the order of the file, since {why}"),)
+        return in_order, (*found, Finding("file", "corrected", f"read in the order of the file, since {why}"))
     if unmerged := [wal for file in files for wal in _write_ahead_logs(file)]:
         database = str(unmerged[0]).removesuffix("-wal")
         text = (
             f"{unmerged[0].name} holds messages that are not yet in the database and are not read, as after a recorder "
             f"that was killed; `sqlite3 {quoted(Path(database))} 'PRAGMA wal_checkpoint(TRUNCATE)'` moves them there"
         )
-        return reader, (Finding("file", "needs you", text),)
+        return reader, (*found, Finding("file", "needs you", text))
     if path.is_dir() and files != [path]:
         if files[0].suffix == ".bag":
             return reader, (Finding("file", "fine", f"{len(files)} .bag file(s), read as one recording"),)
         text = f"the folder has no metadata.yaml; its {len(files)} {files[0].suffix} file(s) were read without it"
         return reader, (Finding("file", "corrected", text),)
-    return reader, ()
+    return reader, found
+
+
+def _read_by_rosbags(path: Path, files: list[Path]) -> tuple[RosbagsStream, tuple[Finding, ...]]:
+    """The files; those of a folder whose metadata.yaml is wrong without that. Raises whatever the library raises."""
+    stream: RosbagsStream | Exception
+    try:
+        stream, why = RosbagsStream(files), "it tells of other messages than the files hold"
+        if not stream.is_contradicted():
+            return stream, ()
+    except Exception as error:
+        stream, why = error, _brief(error)
+    inside = (sorted(path.glob("*.mcap")) or sorted(path.glob("*.db3"))) if files == [path] and path.is_dir() else []
+    with suppress(Exception):
+        if inside and not (bare := RosbagsStream(inside)).is_packed():
+            text = f"the folder's metadata.yaml cannot be used ({why}); its {len(inside)} file(s) were read without it"
+            return bare, (Finding("file", "corrected", text),)
+    if isinstance(stream, Exception):
+        raise stream
+    return stream, ()
 
 
 def _open_capture(path: Path) -> CaptureStream | OusterStream:

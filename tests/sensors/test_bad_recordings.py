@@ -156,7 +156,7 @@ def test_an_mcap_without_the_ros2_profile_is_read_all_the_same(tmp_path: Path) -
 
 
 def test_a_folder_with_broken_metadata_names_the_command_that_makes_it_again(tmp_path: Path) -> None:
-    path = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4), "sqlite3")
+    path = rig.write(tmp_path / "walk", rig.walk(turns=2, columns=4), "sqlite3-message")
     (path / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}")
     assert "ros2 bag reindex" in refusal(path)
 

@@ -1,0 +1,126 @@
+"""What the rosbags library reads: ROS 1 bags, ROS 2 folders and their single files."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from itertools import chain, islice, pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from app.sensors.log_times import FAR_NS, FEW, LATEST_NS, SET_BACK_NS, sound_span
+from app.sensors.ros import Deserialiser
+from app.sensors.unpacking import limit_rosbags
+from app.slam.errors import printable
+from app.slam.types import I64
+
+_PACKED = b"\x28\xb5\x2f\xfd"
+"""How what zstd has compressed begins."""
+
+
+class RosbagsStream:
+    """One recording as rosbags reads it; see `app.sensors.source.Stream`.
+
+    Attributes:
+        wild: how many messages have log times far from all others; they are left out.
+    """
+
+    by_log_time = True
+
+    def __init__(self, files: list[Path]) -> None:
+        """Raises whatever the library raises for a file that it cannot read."""
+        limit_rosbags()
+        self._links = TemporaryDirectory()  # of names that end as rosbags expects
+        files = [self._in_small_letters(path) for path in files]
+        self._standard = Deserialiser()
+        self._reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        self._reader.open()
+        self.counts: dict[str, tuple[str, int]] = {}
+        for connection in self._reader.connections:
+            topic = printable(connection.topic)
+            _, before = self.counts.get(topic, ("", 0))
+            self.counts[topic] = (printable(connection.msgtype), before + connection.msgcount)
+        self.start_ns, self.end_ns, self.wild = self._span()
+
+    def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
+        if self.wild:
+            start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns)
+        connections = [one for one in self._reader.connections if printable(one.topic) in topics]
+        if not connections:  # which rosbags would take for all of them
+            return
+        for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
+            yield printable(connection.topic), log_ns, self._deserialised(raw, connection.msgtype)
+
+    def may_be_disordered(self) -> bool:
+        """Whether chunks of an MCAP step back in time, last too long, or are few and far away; or there are none."""
+        for chunks in (file.chunks for file in self._files() if hasattr(file, "chunks")):
+            if not chunks or any(chunk.message_end_time - chunk.message_start_time > FAR_NS for chunk in chunks):
+                return True
+            for before, after in pairwise(sorted(chunks, key=lambda chunk: chunk.chunk_start_offset)):
+                back_ns = before.message_end_time - after.message_start_time
+                shared = before.message_index_offsets.keys() & after.message_index_offsets.keys()
+                few = min(sum(chunk.channel_count.values()) for chunk in (before, after)) <= FEW
+                if back_ns > (SET_BACK_NS if shared else FAR_NS) or (few and -back_ns > FAR_NS):
+                    return True
+        return False
+
+    def is_contradicted(self) -> bool:
+        """Whether a metadata.yaml tells of other messages than its files hold."""
+        held = chain.from_iterable(file.connections for file in self._files())
+        return self._reader.is2 and _counted(self._reader.connections) != _counted(held)
+
+    def is_packed(self) -> bool:
+        """Whether messages are compressed one by one, as only a metadata.yaml tells."""
+        return any(raw[:4] == _PACKED for _, _, raw in islice(self._reader.messages(), 1))
+
+    def close(self) -> None:
+        self._reader.close()
+        self._links.cleanup()
+
+    def _span(self) -> tuple[int, int, int]:
+        """Log time of the first message, the end after the last, and how many are too far away to count."""
+        if len(times := self._log_times()):
+            return sound_span(times)
+        spans = [file.metadata for file in self._files()] or self._reader.readers  # a metadata.yaml may be wrong
+        start_ns, end_ns = min(one.start_time for one in spans), max(one.end_time for one in spans)
+        return min(start_ns, LATEST_NS), min(end_ns, LATEST_NS), 0
+
+    def _log_times(self) -> I64:
+        """Of all messages of bags and databases."""
+        bags = chain.from_iterable(getattr(reader, "indexes", {}).values() for reader in self._reader.readers)
+        times = [np.array([entry.time for entry in index], np.int64) for index in bags]
+        for file in self._files():
+            if (database := getattr(file, "dbconn", None)) is not None:
+                rows = database.execute("SELECT CAST(ifnull(timestamp, 0) AS INTEGER) FROM messages")
+                times.append(np.fromiter(chain.from_iterable(rows), np.int64))
+        return np.concatenate([np.empty(0, np.int64), *times])
+
+    def _files(self) -> Iterator[Any]:
+        """Those of ROS 2, as rosbags has them open."""
+        for storage in (getattr(reader, "storage", None) for reader in self._reader.readers if self._reader.is2):
+            yield from getattr(storage, "storages", [storage])
+
+    def _deserialised(self, raw: bytes, kind: str) -> Any:
+        """Read standard types as they are defined, whatever the file states about them."""
+        encoding = "cdr" if self._reader.is2 else "ros1"
+        if self._standard.knows(kind, encoding):
+            return self._standard.read(raw, kind, encoding)
+        return self._reader.deserialize(raw, kind)
+
+    def _in_small_letters(self, path: Path) -> Path:
+        if path.suffix == path.suffix.lower():
+            return path
+        link = Path(self._links.name) / path.with_suffix(path.suffix.lower()).name
+        link.symlink_to(path.resolve())
+        return link
+
+
+def _counted(connections: Iterable[Any]) -> Counter[tuple[str, str, str]]:
+    """Messages by topic, type and how they were sent."""
+    counts: Counter[tuple[str, str, str]] = Counter()
+    for one in connections:
+        counts[one.topic, one.msgtype, str(one.ext)] += one.msgcount
+    return counts

@@ -1,0 +1,78 @@
+"""A folder of ROS 2 whose metadata.yaml is wrong: someone renamed a file or changed how topics are to be played, or a
+newer ROS wrote it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from app.sensors.recording import open_recording
+from app.slam.params import Params
+from app.slam.types import Measurement
+from tests.sensors import rig
+
+EVER = {"sec": 1, "nsec": 1}
+QOS = {
+    "history": "keep_last",
+    "depth": 7,
+    "reliability": "best_effort",
+    "durability": "volatile",
+    "deadline": EVER,
+    "lifespan": EVER,
+    "liveliness": "automatic",
+    "liveliness_lease_duration": EVER,
+    "avoid_ros_namespace_conventions": False,
+}
+
+
+def replayed(told: dict[str, Any]) -> None:
+    for topic in told["topics_with_message_count"]:
+        topic["topic_metadata"]["offered_qos_profiles"] = [QOS]
+
+
+@pytest.mark.parametrize("container", ["sqlite3", "mcap"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda told: told.update(version=99),
+        lambda told: told.update(version="x"),
+        lambda told: told.update(relative_file_paths=["renamed.db3"]),
+        lambda told: told.update(relative_file_paths=told["relative_file_paths"] * 2),
+        lambda told: told["topics_with_message_count"].pop(),
+        replayed,
+    ],
+)
+def test_a_wrong_metadata_takes_nothing_from_a_recording(
+    tmp_path: Path, container: str, change: Callable[[dict[str, Any]], None]
+) -> None:
+    duration_s, scans, samples, told = read(tmp_path, container, change)
+    assert (duration_s, scans) == (pytest.approx(3.0, abs=0.2), 30) and samples > 300
+    (finding,) = told
+    assert finding.startswith("the folder's metadata.yaml cannot be used (")
+
+
+@pytest.mark.parametrize("container", ["sqlite3", "sqlite3-message", "sqlite3-file", "mcap"])
+@pytest.mark.parametrize("start_ns", [0, 2**62])
+def test_times_are_those_of_the_messages_whatever_the_metadata_tells(
+    tmp_path: Path, container: str, start_ns: int
+) -> None:
+    def change(told: dict[str, Any]) -> None:
+        told["starting_time"]["nanoseconds_since_epoch"] = start_ns
+        told["duration"]["nanoseconds"] = 7
+
+    duration_s, scans, samples, told = read(tmp_path, container, change)
+    assert (duration_s, scans, told) == (pytest.approx(3.0, abs=0.2), 30, []) and samples > 300
+
+
+def read(folder: Path, container: str, change: Callable[[dict[str, Any]], None]) -> tuple[float, int, int, list[str]]:
+    """Length in s, scans, IMU samples and what is said of the file."""
+    path = rig.write(folder / "walk", rig.walk(turns=30, columns=4), container)
+    told = yaml.safe_load((path / "metadata.yaml").read_text())
+    change(told["rosbag2_bagfile_information"])
+    (path / "metadata.yaml").write_text(yaml.safe_dump(told))
+    with open_recording(path, Params()) as recording:
+        used = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
+        of_file = [finding.text for finding in recording.findings if finding.subject == "file"]
+        return recording.duration_s, len(used), sum(len(entry.imu) for entry in used), of_file
