@@ -50,11 +50,13 @@ class _Commands(TyperGroup):
 
 
 def _of_the_machine(error: Exception) -> str | None:
-    """A sentence about a limit of the machine or the account; None if the error is none of these."""
+    """A sentence about a limit of the machine or the account, or a link; None if the error is none of these."""
     if isinstance(error, BrokenPipeError):
         return None
     if isinstance(error, MemoryError) or "can't start new thread" in str(error):
         return "There is not enough memory; close other programs, or raise the limit (ulimit -v)."
+    if str(error).startswith("Symlink loop"):  # as pathlib says it
+        return f"{error}: a link that leads to itself is no file and no folder; choose another path."
     if isinstance(error, OSError):
         return refusal(error)
     return None

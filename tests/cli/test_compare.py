@@ -57,6 +57,8 @@ def test_what_is_no_map_is_refused(results: Path, hemislam: Call, tmp_path: Path
     (tmp_path / "not.ply").write_text("nonsense")
     assert "damaged" in hemislam("compare", results, tmp_path / "not.ply").refused()
     assert "cannot be read" in hemislam("compare", tmp_path, results).refused()
+    (tmp_path / "loop.ply").symlink_to(tmp_path / "loop.ply")
+    assert "leads to itself" in hemislam("compare", results, results, "--out", tmp_path / "loop.ply").refused()
     away = write(tmp_path / "away.ply", exact(10) + 50.0)
     assert "do not lie on each other" in hemislam("compare", results, away).refused()
     few = write(tmp_path / "few.ply", exact(3))
