@@ -17,7 +17,7 @@ from app.sensors.findings import Finding as Finding
 from app.sensors.findings import FindingVerdict
 from app.sensors.layout import settle_cloud
 from app.sensors.probe import choose_topic, probe_clouds
-from app.sensors.recording import ImuEntry, OtherEntry, ScanEntry, open_recording
+from app.sensors.recording import LACKS, ImuEntry, OtherEntry, ScanEntry, open_recording
 from app.sensors.sequencer import STUCK_SAMPLES, Counts, Sequencer
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
@@ -51,12 +51,14 @@ def examine(
         return _not_mappable(path, params, str(error))
     with recording:
         census = _Census(recording.sequencer())
-        damage = []
+        damage, number = [], 0
         try:
-            for number, entry in enumerate(recording.entries()):
+            for number, entry in enumerate(recording.entries(), 1):
                 census.add(entry)
                 if number % 100 == 0:
                     progress(recording.fraction_at(entry.log_ns))
+            if recording.lacks_messages(number):
+                damage = [Finding(DAMAGE, "needs you", f"{LACKS}; copy {path} again, or use what is there")]
         except HemislamError as error:
             damage = [Finding(DAMAGE, "needs you", str(error))]
         census.take(last=True)

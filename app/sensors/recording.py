@@ -39,6 +39,7 @@ from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan, Vector
 
 SILENCE_S = 0.5
 """A gap without scans at the end, while the IMU goes on, is reported if it is longer than this."""
+LACKS = "the file is damaged: its index tells of more messages than there are"
 NO_IMU = Finding(
     "IMU topic",
     "corrected",
@@ -99,6 +100,7 @@ class Recording(AbstractContextManager["Recording"]):
             self.imu_topic = imu_topic.name
         self.scan_count = lidar.messages
         self.gnss_topic = navsat_topic(source)
+        self._topics = tuple(filter(None, (self.lidar_topic, self.imu_topic, self.gnss_topic)))
 
         probes, probe_findings = probe_clouds(source, lidar)
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
@@ -208,8 +210,7 @@ class Recording(AbstractContextManager["Recording"]):
         offset, leaps = self._log_after_stamp_ns, self._leaps
         log_first = None if first_ns is None else leaps.recorded_ns(first_ns + offset - LOG_MARGIN_NS)
         log_stop = None if stop_ns is None else leaps.recorded_ns(stop_ns + offset + LOG_MARGIN_NS)
-        topics = tuple(filter(None, (self.lidar_topic, self.imu_topic, self.gnss_topic)))
-        return self._read(topics, log_first, log_stop, after)
+        return self._read(self._topics, log_first, log_stop, after)
 
     def _read(
         self, topics: tuple[str, ...], log_first: int | None, log_stop: int | None, after: Mark | None
@@ -232,6 +233,10 @@ class Recording(AbstractContextManager["Recording"]):
     def log_times(self, recorded_ns: I64) -> I64:
         """(n,) log times in the file, with the leaps of the recorder's clock bridged."""
         return recorded_ns + all_added_ns(self._leaps.log, recorded_ns)
+
+    def lacks_messages(self, read: int) -> bool:
+        """Whether so many messages, read from begin to end, are fewer than the file's index tells."""
+        return self._source.lacks(self._topics, read)
 
     def leaps_told(self, after_ns: int, until_ns: int) -> list[str]:
         """A sentence for each leap of a clock between two log times in the file."""
@@ -337,6 +342,8 @@ class Measurements(Iterator[Measurement | DroppedScan]):
         yield from sequencer.finish()
         if stop_ns is None and damage is None and sequencer.silent_s > SILENCE_S:
             yield DroppedScan(first_ns, "the LiDAR falls silent before the recording ends")
+        if self._ended and self._part == (0.0, None) and self._message and recording.lacks_messages(self._message.read):
+            yield DroppedScan(first_ns, LACKS)
         if damage is not None:
             raise damage
         if not sequencer.counts.paired:

@@ -133,6 +133,10 @@ class Source(AbstractContextManager["Source"]):
             log_ns = entry[1]
             yield entry
 
+    def lacks(self, topics: tuple[str, ...], read: int) -> bool:
+        """Whether so many messages of these topics, read from begin to end, are fewer than the file's index tells."""
+        return read < sum(topic.messages for topic in self.topics if topic.name in topics) - self._stream.wild
+
     def close(self) -> None:
         self._stream.close()
 
@@ -185,6 +189,8 @@ def _read_by_rosbags(path: Path, files: list[Path]) -> tuple[RosbagsStream, tupl
     with suppress(Exception):
         if inside and not (bare := RosbagsStream(inside)).is_packed():
             text = f"the folder's metadata.yaml cannot be used ({why}); its {len(inside)} file(s) were read without it"
+            if isinstance(stream, RosbagsStream):
+                stream.close()
             return bare, (Finding("file", "corrected", text),)
     if isinstance(stream, Exception):
         raise stream

@@ -1,6 +1,7 @@
 """A folder of ROS 2 whose metadata.yaml is wrong: someone renamed a file or changed how topics are to be played, or a
 newer ROS wrote it."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,9 +9,10 @@ from typing import Any
 import pytest
 import yaml
 
-from app.sensors.recording import open_recording
+from app.sensors.doctor import DAMAGE, examine
+from app.sensors.recording import LACKS, open_recording
 from app.slam.params import Params
-from app.slam.types import Measurement
+from app.slam.types import DroppedScan, Measurement
 from tests.sensors import rig
 
 EVER = {"sec": 1, "nsec": 1}
@@ -76,3 +78,20 @@ def read(folder: Path, container: str, change: Callable[[dict[str, Any]], None])
         used = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
         of_file = [finding.text for finding in recording.findings if finding.subject == "file"]
         return recording.duration_s, len(used), sum(len(entry.imu) for entry in used), of_file
+
+
+def test_messages_that_a_damaged_file_has_lost_are_missed(tmp_path: Path) -> None:
+    """A length in a chunk without a checksum is wrong, and rosbags takes all that follows for one record."""
+    path = rig.write(tmp_path / "walk", rig.walk(turns=30, columns=4), "bare-mcap")
+    content = bytearray(path.read_bytes())
+    sample = bytes(rig.TYPESTORES[2].serialize_cdr(rig.imu(0), "sensor_msgs/msg/Imu"))
+    head = b"\x05" + (22 + len(sample)).to_bytes(8, "little")
+    places = [found.start() for found in re.finditer(re.escape(head), content)]
+    content[places[100] : places[100] + 9] = b"\x7f" + (2**40).to_bytes(8, "little")
+    path.write_bytes(content)
+    with open_recording(path, Params()) as recording:
+        entries = list(recording.measurements())
+    assert sum(isinstance(entry, Measurement) for entry in entries) < 20
+    assert [entry.reason for entry in entries if isinstance(entry, DroppedScan)] == [LACKS]
+    (finding,) = [finding for finding in examine(path, Params()) if finding.subject == DAMAGE]
+    assert finding.verdict == "needs you" and "damaged" in finding.text
