@@ -67,6 +67,14 @@ class RosbagsStream:
                     return True
         return False
 
+    def is_unindexed(self) -> bool:
+        """Whether an MCAP does not tell which messages are in a chunk, or of how many on each topic."""
+        for chunks in (getattr(file, "chunks", []) for file in self._files()):
+            if chunks and not any(chunk.message_index_offsets for chunk in chunks):
+                return True
+        held = sum(file.metadata.message_count for file in self._files())
+        return held > 0 and not any(count for _, count in self.counts.values())
+
     def is_contradicted(self) -> bool:
         """Whether a metadata.yaml tells of other messages than its files hold."""
         held = chain.from_iterable(file.connections for file in self._files())

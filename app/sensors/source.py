@@ -157,9 +157,11 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         if salvaged is None:
             raise HemislamError(_refusal(path, error)) from error
         return salvaged
-    if reader.may_be_disordered() and (in_order := _in_file_order(path, files)):
+    unindexed = reader.is_unindexed()
+    if (unindexed or reader.may_be_disordered()) and (in_order := _in_file_order(path, files, always=unindexed)):
         reader.close()
-        why = "the recorder's clock was set back on the way" if in_order.set_back else "log times in it are wrong"
+        wrong = "it has no index of its messages" if unindexed else "log times in it are wrong"
+        why = "the recorder's clock was set back on the way" if in_order.set_back else wrong
         return in_order, (*found, Finding("file", "corrected", f"read in the order of the file, since {why}"))
     if unmerged := [wal for file in files for wal in _write_ahead_logs(file)]:
         database = str(unmerged[0]).removesuffix("-wal")
@@ -218,13 +220,13 @@ def _write_ahead_logs(path: Path) -> list[Path]:
     return [wal for wal in found if is_file(wal) and wal.stat().st_size]
 
 
-def _in_file_order(path: Path, files: list[Path]) -> McapStream | None:
-    """The files of an MCAP read from front to back, if log times are wrong or step back on the way."""
+def _in_file_order(path: Path, files: list[Path], *, always: bool) -> McapStream | None:
+    """The files of an MCAP read from front to back, if log times are wrong or step back on the way, or always."""
     try:
         stream = McapStream(sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files)
     except Exception:  # whatever a damaged file may cause; rosbags reads it
         return None
-    return None if stream.sorted and not stream.wild else stream
+    return stream if stream.counts and (always or stream.wild or not stream.sorted) else None
 
 
 def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Finding, ...]] | None:
