@@ -46,7 +46,7 @@ def read_points(path: Path, thin: float, progress: Callable[[float], None] = lam
             taken.append(points[voxels.new(points)])
             progress(share)
     except OSError as error:
-        raise HemislamError(f"The map {path} cannot be read: {error.strerror or error}.") from None
+        raise HemislamError(f"The map {path} cannot be read: {error.strerror or error}; check the path.") from None
     except (ValueError, KeyError, IndexError, laspy.LaspyException, lazrs.LazrsError) as error:
         raise HemislamError(f"The map {path.name} is damaged or of an unknown kind ({error}).") from None
     if not (found := np.concatenate(taken)).size:

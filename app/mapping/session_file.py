@@ -246,7 +246,7 @@ def read_session(path: Path) -> SavedSession:
     try:
         lines = path.read_bytes().split(b"\n")[:-1]
     except OSError as error:
-        raise HemislamError(f"The session {path} cannot be read: {error.strerror}.") from None
+        raise HemislamError(f"The session {path} cannot be read: {error.strerror}; check the path.") from None
     entries = []
     for line in lines:
         try:

@@ -103,4 +103,4 @@ def test_labels_that_cannot_be_read_are_named_in_a_sentence(name: str, tmp_path:
     with pytest.raises(HemislamError) as refused:
         read_marks(tmp_path / name)
     assert str(tmp_path / name) in str(refused.value) and "Errno" not in str(refused.value)
-    assert "codec" not in str(refused.value)
+    assert "codec" not in str(refused.value) and ";" in str(refused.value), "it says what to do"
