@@ -77,7 +77,7 @@ class Proposal:
         command: the edit under consideration. preview: what the engine says of it, or of the one that is only shown.
         ghost: the trajectory beside the present one.
         last: the edit applied last, until it is undone or another one follows.
-        happened: HTML of what the last edit, or its undo, did. about: the loop whose verdict it was.
+        happened: HTML of what the last edit, its undo or its redo did. about: the loop whose verdict it was.
     """
 
     def __init__(self, page: Page, applied: Callable[[LoopEdit], None]) -> None:
@@ -123,7 +123,7 @@ class Proposal:
             self.happened = ""
 
     def see(self, snapshot: Snapshot) -> None:
-        """Note what the last edit did, once the snapshot has it, or that it was undone."""
+        """Note what the last edit did, once the snapshot has it, or that it was undone or redone."""
         seen, self._seen = self._seen, snapshot
         edits, now, before, poses = seen.loops.undo, snapshot.loops.undo, seen.keyframe_poses, snapshot.keyframe_poses
         last = self.last
@@ -134,6 +134,8 @@ class Proposal:
             self.last = self._before = None
             self.happened = what_was_undone(edits[-1], snapshot.loops.edges, before, poses)
             self.about = decided(edits[-1])
+        elif seen.loops.redo and now == (*edits, seen.loops.redo[-1]):
+            self.happened, self.about = what_happened(now[-1], before, poses), decided(now[-1])
         elif last is not None and self._after is not None and now[-1:] != (last,):
             self.last, self.happened = None, ""
 

@@ -90,6 +90,23 @@ def test_after_an_edit_the_map_is_shown_with_the_path_before_it_and_what_moved_b
     assert inspector.alone and not proposal.ghost.key[0][1].startswith("path before")
 
 
+def test_after_a_redo_the_loop_is_not_said_to_be_as_it_was_before(page: Page) -> None:
+    page.choose(GOOD)
+    user_clicks(page.loops._verdict._reject)
+    page.draw()
+    said = page.loops._verdict._words.content
+    assert "Rejected 12–89" in said
+    page.engine.send(UndoLoop())
+    page.draw()
+    assert "Loop 12–89 is accepted again" in page.loops._verdict._words.content
+    page.engine.send(RedoLoop())
+    page.draw()
+    assert page.edge(GOOD).verdict is Verdict.REJECTED and page.loops._verdict._words.content == said
+    page.engine.send(UndoLoop())
+    page.draw()
+    assert "Loop 12–89 is accepted again" in page.loops._verdict._words.content
+
+
 def test_the_last_edit_can_be_undone_though_another_loop_is_looked_at(page: Page) -> None:
     page.choose(GOOD)
     user_clicks(page.loops._verdict._reject)
