@@ -7,6 +7,8 @@ viser has no events for HTML, no way to run a script, and keys of its own. So th
   HTML is that HTML's previous sibling.
 * A text field is an `<input>` whose `input` events viser sends.
 * Hotkeys are listened to on the html element, the camera's keys on the document.
+* A button has the class `mantine-Button-root`, and `gray-filled` in its style if it is gray; a text field has the class
+  `mantine-TextInput-input`.
 * A number box is an `<input class="mantine-NumberInput-input">` whose `input` events viser sends; that of a slider
   stands beside its track.
 * Tooltips have the class `mantine-Tooltip-tooltip`, and the scene is a `<canvas data-engine>`.

@@ -1,4 +1,4 @@
-"""Keys of the page in a real Chromium: held ones, and those pressed while a dialog is open.
+"""Keys of the page in a real Chromium: held ones, those pressed while a dialog is open, and what is typed.
 
 Tests app/ui/viser_adapter.py.
 """
@@ -6,6 +6,7 @@ Tests app/ui/viser_adapter.py.
 import pytest
 from playwright.sync_api import expect
 
+from app.server.keeping import AddNote
 from app.server.protocol import Play, StepFrame
 from tests.browser.conftest import Bench
 
@@ -45,3 +46,17 @@ def test_behind_a_dialog_keys_do_nothing(bench: Bench) -> None:
     bench.page.keyboard.press("Escape")
     expect(cancel).to_have_count(0)
     bench.press("ArrowRight", lambda: StepFrame() in bench.engine.sent)
+
+
+def test_a_click_right_after_typing_takes_all_that_was_typed(bench: Bench) -> None:
+    page = bench.page
+    page.get_by_role("tab", name="Recording").click()
+    button = page.get_by_role("button", name="Add note")
+    button.scroll_into_view_if_needed()
+    button.locator("xpath=preceding::input[1]").click()
+    box = button.bounding_box()
+    assert box is not None
+    page.keyboard.type("cracked wall")
+    page.mouse.click(box["x"] + 20, box["y"] + 10)
+    bench.eventually(lambda: bench.engine.sent == [AddNote("cracked wall")], 20)
+    page.get_by_role("tab", name="Parameters").click()

@@ -75,6 +75,10 @@ ASSUMPTIONS = {
         "components/NumberInput.tsx",
         'import { NumberInput } from "@mantine/core";',
     ),
+    "A button is no longer Mantine's: a click loses what was just typed, and Enter does nothing in a dialog.": (
+        "components/Button.tsx",
+        'import { Button } from "@mantine/core";',
+    ),
     "Panels are no longer dimmed while the server is lost: nothing says so in words.": (
         "ControlPanel/Generated.tsx",
         'pointerEvents: connected ? undefined : "none",\n        transition: "opacity 150ms ease",',

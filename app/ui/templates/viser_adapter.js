@@ -37,6 +37,16 @@ if (!window.hemislamSay) {
     if (!sending) send(false);
   };
 
+  // For the same reason a click on one of viser's buttons waits until what was typed before it has been sent.
+  let typed = -QUIET_MS;
+  document.addEventListener('input', () => { typed = performance.now(); }, true);
+  document.addEventListener('click', (event) => {
+    const button = event.target.closest('.mantine-Button-root'), rest = typed + QUIET_MS - performance.now();
+    if (!button || rest <= 0) return;
+    event.stopImmediatePropagation();
+    setTimeout(() => button.click(), rest);
+  }, true);
+
   // On a phone the panel is low, its tabs alone, until one is tapped; the same one lowers it again.
   const sheet = document.documentElement.dataset;
   sheet.hsSheet = 'low';
