@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import expect
 
 from app.server.keeping import AddNote
-from app.server.protocol import Play, StepFrame
+from app.server.protocol import Play, Save, StepFrame
 from tests.browser.conftest import Bench
 
 
@@ -59,4 +59,19 @@ def test_a_click_right_after_typing_takes_all_that_was_typed(bench: Bench) -> No
     page.keyboard.type("cracked wall")
     page.mouse.click(box["x"] + 20, box["y"] + 10)
     bench.eventually(lambda: bench.engine.sent == [AddNote("cracked wall")], 20)
+    page.get_by_role("tab", name="Parameters").click()
+
+
+def test_enter_in_a_dialog_does_what_its_button_says_with_all_that_was_typed(bench: Bench) -> None:
+    page = bench.page
+    bench.next_frame()
+    page.get_by_role("tab", name="Recording").click()
+    page.get_by_role("button", name="Save results").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_role("textbox").first.click(click_count=3)
+    page.keyboard.type("north wing")
+    page.keyboard.press("Enter")
+    expect(dialog).to_have_count(0, timeout=20_000)
+    (save,) = (command for command in bench.engine.sent if isinstance(command, Save))
+    assert save.folder.name == "north wing"
     page.get_by_role("tab", name="Parameters").click()

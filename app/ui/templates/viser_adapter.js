@@ -110,10 +110,13 @@ if (!window.hemislamSay) {
 
   // Keys. On its way up an event passes widgets (the page's root), the body, viser's hotkeys (the html element) and
   // viser's camera (the document). Left and right move a focused slider or tab, else step a frame, never the camera.
-  // Another key that is held counts once. Behind a dialog no key counts.
+  // Another key that is held counts once. Behind a dialog no key counts; in its text fields Enter is its coloured button.
   const sideways = (event) => event.key === 'ArrowLeft' || event.key === 'ArrowRight';
   document.body.addEventListener('keydown', (event) => {
     if (event.key === 'Escape' || event.key === 'Tab') return;
+    if (event.key === 'Enter' && !event.repeat && !event.isComposing && event.target.matches('.mantine-Modal-body .mantine-TextInput-input')) {
+      event.target.closest('.mantine-Modal-body').querySelector('.mantine-Button-root:not([style*="gray-filled"])')?.click();
+    }
     const taken = sideways(event) ? event.target.closest('[role=slider],[role=tab]') : event.repeat;
     if (taken || document.querySelector('.mantine-Modal-body')) event.stopPropagation();
   });
