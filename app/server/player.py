@@ -55,13 +55,16 @@ class Pacer:
         self._anchor = (now, stamp_ns) if late else (started, first_ns)
         return max(0.0, due - now)
 
-    def tick(self) -> float:
-        """Count a processed frame; returns the frames per second over about the last second."""
+    def tick(self) -> None:
+        """Count a processed frame."""
+        self._processed.append(self._clock())
+
+    def rate(self) -> float:
+        """Frames per second over about the last second."""
         now = self._clock()
-        self._processed.append(now)
         while len(self._processed) > 2 and self._processed[0] < now - 1.0:
             self._processed.popleft()
-        elapsed = now - self._processed[0]
+        elapsed = now - self._processed[0] if self._processed else 0.0
         return (len(self._processed) - 1) / elapsed if 0 < elapsed < 10 else 0.0
 
 
@@ -205,6 +208,8 @@ class Player:
                 self._page.show(finished=True)
                 return None
             self._page.put(live=state, recording=opened_recording(session))
+            if self._page.transport.playing:  # also once it sends nothing more
+                self._page.show(frames_per_second=self._pacer.rate(), urgent=False)
         return SOURCE_PERIOD_S
 
     def fail(self, what: str, error: Exception) -> None:
@@ -256,7 +261,8 @@ class Player:
             self.page_behind = True
         else:
             self._page.frame(session, result)
-            self._page.show(frames_per_second=self._pacer.tick(), urgent=False)
+            self._pacer.tick()
+            self._page.show(frames_per_second=self._pacer.rate(), urgent=False)
             self._passed(session, result, played=target is None)
             checks, rest = divmod(session.frame, FIRST_DOUBT)
             if not rest and checks.bit_count() == 1:

@@ -186,6 +186,13 @@ def test_what_a_robot_sends_gives_the_same_walk_as_the_file(live: Live, from_fil
     assert apart(snapshot, from_file) < 0.001
 
 
+def test_a_source_that_sends_no_more_is_not_shown_at_its_last_rate(live: Live) -> None:
+    live.play(4.0).join(PATIENCE_S)
+    assert live.until_all_is_mapped().transport.frames_per_second > 1.0
+    still = live.until(lambda s: s.transport.frames_per_second == 0.0)
+    assert still.transport.playing
+
+
 def test_an_engine_that_is_killed_is_followed_by_one_that_goes_on_in_the_same_map(
     live: Live, from_file: dict[int, np.ndarray]
 ) -> None:
