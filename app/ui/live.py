@@ -36,17 +36,17 @@ _TROUBLES: Final = {
 """Counted, and shown once they are not zero."""
 
 
-def live_html(state: LiveState, *, ended: bool = False) -> str:
+def live_html(state: LiveState, *, ended: bool = False, paused: bool = False) -> str:
     """The panel: one tile a reading, coloured by how good it is; then the rarer counts.
 
-    ended: nothing more will come; these are the last readings.
+    ended: nothing more will come; these are the last readings. paused: by the user, so that scans wait.
     """
-    judged = ("ended", BAD) if ended else verdict(state)
+    judged = ("ended", BAD) if ended else verdict(state, paused=paused)
     rare = [f"{count:,} {text}" for name, text in _TROUBLES.items() if (count := getattr(state.counters, name))]
     return panel("live", state.sensor or "The sensor has not described itself yet.", *judged, list(_tiles(state)), rare)
 
 
-def verdict(state: LiveState) -> tuple[str, str]:
+def verdict(state: LiveState, *, paused: bool = False) -> tuple[str, str]:
     """The worst reading in a few words, and its colour."""
     ages = (("LiDAR", state.lidar_age_s), ("IMU", state.imu_age_s))
     for name, age in ages:
@@ -56,7 +56,7 @@ def verdict(state: LiveState) -> tuple[str, str]:
         if age is not None and age > SILENT_S:
             return f"{name} silent", BAD
     if state.backlog > BUSY_BACKLOG:
-        return "engine behind", WARN
+        return "scans wait" if paused else "engine behind", WARN
     if not state.clock:
         return "settling", WARN
     return "receiving", GOOD
@@ -123,4 +123,5 @@ class LivePanel:
         self._html.visible = snapshot.live is not None
         self._back.visible = self._was_live and snapshot.live is None and snapshot.progress is None
         if snapshot.live is not None:
-            self._html.content = live_html(snapshot.live, ended=snapshot.transport.finished)
+            transport = snapshot.transport
+            self._html.content = live_html(snapshot.live, ended=transport.finished, paused=not transport.playing)

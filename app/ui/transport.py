@@ -138,6 +138,9 @@ def where(snapshot: Snapshot) -> str:
         if transport.frame < 0:
             return panel("quiet", f"Waiting for the first scan. {forward}")
         dropped = f"{transport.dropped:,} scans dropped" if transport.dropped else "no scan dropped"
+        if not transport.playing and snapshot.live.backlog:
+            dropped = f"{snapshot.live.backlog:,} scans wait"
+            forward = "If too many scans wait, the oldest are dropped. Play continues with the rest."
         return panel("where", frame, ", live", "", dropped, stamp, rate, forward)
     if transport.frame < 0:
         return panel(

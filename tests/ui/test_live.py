@@ -11,10 +11,10 @@ import pytest
 import viser
 
 from app.sensors.live.status import Counters, LiveState
-from app.server.protocol import LIVE, Command, OpenRecording, Play
+from app.server.protocol import LIVE, Command, OpenRecording, Play, StepFrame
 from app.ui.html import BAD, GOOD, WARN
 from app.ui.live import LivePanel, live_html, verdict
-from app.ui.transport import TransportPanel, state
+from app.ui.transport import TransportPanel, state, where
 from tests.ui.conftest import Clock, Wire, page_of, user_clicks
 from tests.ui.fake_engine import FakeEngine
 
@@ -62,6 +62,20 @@ def test_what_is_not_known_is_a_dash_and_not_zero() -> None:
 )
 def test_the_worst_is_said_in_a_word(state: LiveState, words: str, colour: str) -> None:
     assert verdict(state) == (words, colour)
+
+
+def test_while_the_user_has_paused_the_engine_is_not_called_behind() -> None:
+    assert verdict(replace(WELL, backlog=99), paused=True) == ("scans wait", WARN)
+
+
+def test_the_bar_says_what_a_pause_costs_instead_of_that_no_scan_was_dropped(engine: FakeEngine) -> None:
+    engine.send(StepFrame(5))
+    playing = replace(engine.snapshot.transport, playing=True)
+    engine.publish(live=replace(WELL, backlog=99, counters=Counters(dropped=40)), transport=playing)
+    assert "no scan dropped" in where(engine.snapshot) and "wait" not in where(engine.snapshot)
+    engine.publish(transport=replace(playing, playing=False))
+    assert "99 scans wait" in where(engine.snapshot) and "no scan dropped" not in where(engine.snapshot)
+    assert "the oldest are dropped" in where(engine.snapshot)
 
 
 def test_an_ended_source_is_not_shown_as_receiving() -> None:
