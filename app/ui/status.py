@@ -121,8 +121,8 @@ class DoctorPanel:
     def draw(self, snapshot: Snapshot) -> None:
         if not self._changes(snapshot.recording, snapshot.params):
             return
-        self._title.visible = self._html.visible = snapshot.recording is not None
         findings = snapshot.recording.findings if snapshot.recording else ()
+        self._title.visible = self._html.visible = bool(findings)
         self._html.content = self._bridge.live(findings_html(findings, snapshot.params))
 
     def _settle(self, option: str) -> None:

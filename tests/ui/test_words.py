@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import viser
 
 from app.sensors.findings import Finding
 from app.sensors.live.status import LiveState
@@ -31,8 +32,9 @@ from app.ui.hints import HINTS
 from app.ui.html import BAD, GOOD, WARN, Tile, panel, source
 from app.ui.loops.words import KINDS, LoopKind
 from app.ui.readouts import HISTORY, filter_tiles, plotted, stacked_stages, times_html
-from app.ui.status import findings_html, log_html, settled, title, verdicts
+from app.ui.status import DoctorPanel, findings_html, log_html, settled, title, verdicts
 from app.ui.transport import where
+from tests.ui.conftest import page_of
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
 
@@ -42,6 +44,15 @@ def test_findings_that_need_the_user_come_first_with_their_option() -> None:
     assert "<code>--set imu.max_gap=0.4</code>" in text
     assert verdicts(FINDINGS) == ("2 checks passed, 1 corrected, 1 needs attention", BAD)
     assert verdicts(FINDINGS[:1]) == ("1 check passed", GOOD) and verdicts(()) is None
+
+
+def test_a_live_source_without_checks_has_no_heading_for_them(server: viser.ViserServer, engine: FakeEngine) -> None:
+    doctor, recording = DoctorPanel(page_of(server)), engine.snapshot.recording
+    assert recording is not None
+    doctor.draw(engine.snapshot)
+    assert doctor._title.visible
+    doctor.draw(replace(engine.snapshot, recording=replace(recording, findings=())))
+    assert not doctor._title.visible
 
 
 def test_the_time_of_every_stage_has_its_unit() -> None:
