@@ -85,7 +85,7 @@ class Controller:
         self._params = self._base = params  # with and without the user's changes
         self._kept = kept
         self._resuming: SavedSession | None = None  # that is being repeated
-        self._opening: Callable[[], None] | None = None  # opens the next session
+        self._opening: tuple[protocol.Progress, Callable[[], None]] | None = None  # opens the next session
         self._waiting: list[Command] = []  # until that session is at its frame
         self._of_before = 0  # how many of these, the first ones, waited when another one was asked for
 
@@ -184,8 +184,11 @@ class Controller:
         self._share = share
 
     def _show_share(self, share: float | None) -> None:
-        """How far a save is, in steps of a hundredth; None: it has ended."""
-        shown = None if share is None else protocol.Progress("Saving", math.floor(share * 100) / 100)
+        """How far a save is, in steps of a hundredth; None: it has ended. What is to be opened waits for it."""
+        shown = self._opening[0] if self._opening is not None else None
+        if share is not None:
+            then = f", then {shown.title[0].lower()}{shown.title[1:]}" if shown is not None else ""
+            shown = protocol.Progress(f"Saving{then}", math.floor(share * 100) / 100)
         if shown != self._shown_share:
             self._shown_share = shown
             self._page.put(progress=shown, urgent=True)
@@ -221,6 +224,7 @@ class Controller:
             self._page.notice("warning", self._writer.error)
 
     def _work(self) -> float | None:
+        saving = bool(self._saves)
         while self._saves and self._saves[0][1].done():
             command, save = self._saves.popleft()
             self._share = 0.0
@@ -233,8 +237,10 @@ class Controller:
             self._page.saved(protocol.Saved(command.folder, why, command.fetched, mendable))
         if self._saves:
             self._show_share(self._share)
+        if self._opening is not None and saving:
+            return POLL_S if self._saves else 0.0  # the page first says that it is being opened
         if self._opening is not None:
-            self._do_opening(self._opening)
+            self._do_opening(self._opening[1])
             return 0.0
         wait, session = self._player.work(), self._player.session
         if session is None:
@@ -272,8 +278,8 @@ class Controller:
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
         """Let `work` open it, so that the page first says that this takes a moment."""
-        self._opening, self._of_before = opening, len(self._waiting)
-        self._page.put(progress=protocol.Progress.opening(path), urgent=True)
+        self._opening, self._of_before = (protocol.Progress.opening(path), opening), len(self._waiting)
+        self._page.put(progress=self._opening[0], urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
         """Open; if that is not possible, everything stays as it is."""

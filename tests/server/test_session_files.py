@@ -23,6 +23,7 @@ from app.server.protocol import (
     OpenRecording,
     Pause,
     Play,
+    Progress,
     Restart,
     Save,
     Seek,
@@ -209,6 +210,25 @@ def test_a_save_that_waits_does_not_show_how_far_the_last_one_was(tmp_path: Path
     snapshot = bench.do(Save(tmp_path / "second", ("ply",)))
     assert snapshot.progress is not None and snapshot.progress.fraction == 0.0
     may_go_on.set()
+
+
+def test_a_recording_that_has_to_wait_for_a_save_says_so_and_can_still_be_another(tmp_path: Path) -> None:
+    bench, may_go_on = Bench(), threading.Event()
+    bench.do(Seek(30))
+    bench.sessions[-1]._saves.submit(may_go_on.wait, 5.0)
+    waiting = bench.do(Save(tmp_path / "first", ("ply",)), OpenRecording(Path("walk-30.mcap")))
+    assert waiting.progress is not None and waiting.progress.title == "Saving, then opening walk-30.mcap"
+    waiting = bench.do(OpenRecording(Path("walk-20.mcap")))
+    assert waiting.progress is not None and waiting.progress.title == "Saving, then opening walk-20.mcap"
+    assert waiting.recording is not None and waiting.recording.path == Path("walk-60.mcap")
+    may_go_on.set()
+    while bench.controller.work() != 0:
+        pass
+    saved = bench.see()
+    assert saved.saved[0].error == "" and saved.progress == Progress.opening(Path("walk-20.mcap"))
+    opened = bench.settle()
+    assert opened.recording is not None and opened.recording.path == Path("walk-20.mcap") and opened.progress is None
+    assert len(bench.sessions) == 2
 
 
 @pytest.mark.parametrize(("name", "why"), [("file", "File exists"), ("n" * 300, "File name too long")])
