@@ -125,6 +125,6 @@ class AppearancePanel:
         by = LABEL if view.tuning else view.colour_by
         colours = legend(by, limits, view.ends) if view.map or view.scan else ""
         self._legend.content = panel("legend", colours, lines, view.grid)
-        words = f"{points:,} map points are drawn. Of a map of more than {budget:,}, most are near the camera."
+        words = f"{points:,} map points are drawn; of more than {budget:,}, mainly those near the camera."
         about = f" {moving:,} points on moving things are {'shown' if view.moving else 'hidden'}." if moving else ""
         self._count.content = panel("note", f"{words} The engine keeps the whole map.{about}")
