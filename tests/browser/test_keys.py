@@ -7,13 +7,32 @@ import pytest
 from playwright.sync_api import expect
 
 from app.server.keeping import AddNote
-from app.server.protocol import Play, Save, StepFrame
+from app.server.protocol import Pause, Play, Save, StepFrame
 from tests.browser.conftest import Bench
 
 
 @pytest.fixture(autouse=True)
 def _fresh(bench: Bench) -> None:
     bench.engine.sent.clear()
+
+
+def test_space_plays_and_pauses(bench: Bench) -> None:
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: bench.engine.snapshot.transport.playing)
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: not bench.engine.snapshot.transport.playing)
+    assert [type(command) for command in bench.engine.sent] == [Play, Pause]
+
+
+def test_space_after_a_click_on_a_button_does_not_click_it_again(bench: Bench) -> None:
+    bench.page.get_by_role("button", name="Step", exact=True).click()
+    bench.eventually(lambda: bench.engine.sent == [StepFrame()])
+    bench.page.wait_for_function("document.activeElement === document.body")  # no ring stays
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: bench.engine.snapshot.transport.playing)
+    bench.page.keyboard.press("Space")
+    bench.eventually(lambda: not bench.engine.snapshot.transport.playing)
+    assert bench.engine.sent.count(StepFrame()) == 1
 
 
 def test_a_key_that_is_held_counts_once_but_an_arrow_goes_on(bench: Bench) -> None:
