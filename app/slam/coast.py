@@ -34,6 +34,9 @@ GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
 """Of the residuals in each iteration, times the filter's gate; wide at first, since nothing measures the motion."""
 CONVERGED_ROTATION, CONVERGED_TRANSLATION = 1e-4, 1e-3
 """rad, m: an increment below these ends the iteration."""
+ENOUGH_PLANES, ENOUGH_SHARE, WALKING = 50, 0.45, 0.3
+"""Fewer good planes than ENOUGH_PLANES, or above WALKING m/s than ENOUGH_SHARE of the points, are too few; then poor
+ones are used too. Where good ones leave a direction open, as in a bare corridor, poor ones must not hold the scan."""
 UNSURE = 0.2
 """m/s: standard deviation of the speed from which it is better found from the scan's own distortion than taken from the
 prediction: points are then off by over 1 cm."""
@@ -166,7 +169,8 @@ def update(
     ago = ((scan.stamp_ns - prior.state.stamp_ns + scan.offsets_ns.astype(np.int64)) * 1e-9)[:, None]  # <= 0
     free = DIM if extrinsics else iekf.NAVIGATION
     information, here = np.asarray(np.linalg.inv(prior.covariance[:free, :free])), prior.state
-    enough = iekf.enough_planes(len(scan), float(np.linalg.norm(here.v_odom_imu)))
+    walks = float(np.linalg.norm(here.v_odom_imu)) > WALKING
+    enough = max(ENOUGH_PLANES, ENOUGH_SHARE * len(scan)) if walks else ENOUGH_PLANES
     converged, iteration, covariance = False, 0, information
     for iteration, gate in enumerate(GATES, 1):
         points = deskew(scan, here, course)

@@ -25,11 +25,11 @@ CONVERGED_TRANSLATION = 1e-4
 """rad, m: an increment below these ends the iteration."""
 MIN_INLIERS = 30
 """Least number of planes for an update; with fewer the prediction stands."""
-ENOUGH_PLANES, ENOUGH_SHARE, WALKING = 50, 0.45, 0.3
-"""Fewer good planes than ENOUGH_PLANES, or above WALKING m/s than ENOUGH_SHARE of the points, are too few. Then poor
-planes are used too, weighted by their certainty: where the map is noisy or cluttered, they are better than none.
-Before the first step the map was seen from one place only, and poor planes along its scan lines would hold the scanner
-there."""
+OPEN_SIGMA = 0.03
+"""m (rotation: as below): if good planes leave a direction less certain than this, poor ones are used too, weighted by
+their certainty. In a park all good planes lie on the ground, and only trunks hold the scanner along it."""
+MANY_PLANES = 0.45
+"""Share of a scan's points with a plane from which on the scan is trusted where it contradicts the IMU."""
 SURPRISING = 4.0
 """Surprise of a frame (`Registration`) above which the scan and the IMU contradict each other. Clean sensors stay below
 0.3, imperfect ones below 3.5; where scans show little but people and false points, it reaches 5 to 89."""
@@ -67,11 +67,6 @@ def _unpacked(x: F64, stamp_ns: int) -> NavState:
     return NavState(stamp_ns, R.reshape(3, 3), p, v, bg, ba, g, R_il.reshape(3, 3), p_il)
 
 
-def enough_planes(points: int, speed: float) -> float:
-    """How many good planes are enough for so many points at this speed (m/s); with fewer, poor ones are used too."""
-    return max(ENOUGH_PLANES, ENOUGH_SHARE * points) if speed > WALKING else ENOUGH_PLANES
-
-
 def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams) -> tuple[Belief, Registration]:
     """Fuse one scan: minimise eq. 7 from the predicted belief.
 
@@ -91,21 +86,26 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     covariance, step = np.empty((free, free)), np.empty(DIM)
     planes: Planes | None = None
     since_search = np.zeros(DIM)
-    converged, iteration, poor = False, 0, False
-    enough = enough_planes(n, float(np.linalg.norm(prior.state.v_odom_imu)))
+    converged, iteration, sure = False, 0, True
+
+    def accumulate(planes: Planes) -> None:
+        R, p, R_il, p_il = x[0:9].reshape(3, 3), x[9:12], x[24:33].reshape(3, 3), x[33:36]
+        kernels.normal_equations(
+            points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
+            planes.deviations, params.gate, H, b, stats, residuals,
+        )  # fmt: skip
 
     for iteration in range(1, params.max_iterations + 1):
         R, p, R_il, p_il = x[0:9].reshape(3, 3), x[9:12], x[24:33].reshape(3, 3), x[33:36]
         if planes is None or _over(since_search, RESEARCH_ROTATION, RESEARCH_TRANSLATION):
             kernels.to_world(points, R, p, R_il, p_il, world)
-            planes, poorer = local_map.planes(world, R @ p_il + p, params)
-            poor = poor or bool(np.count_nonzero(planes.variances >= 0.0) < enough)
-            planes = poorer if poor else planes
+            good, poor = local_map.planes(world, R @ p_il + p, params)
+            if sure:
+                accumulate(good)
+                sure = stats[0] >= MIN_INLIERS and not is_open(points, H)
+            planes = good if sure else poor
             since_search[:] = 0.0
-        kernels.normal_equations(
-            points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
-            planes.deviations, params.gate, H, b, stats, residuals,
-        )  # fmt: skip
+        accumulate(planes)
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
         H, b = _nonnegative(H, b)
@@ -140,9 +140,14 @@ def schmidt(prior: F64, information: F64, covariance: F64) -> F64:
     return posterior
 
 
+def is_open(points: F32, H: F64) -> bool:
+    """Whether a direction is less certain than OPEN_SIGMA, by the information H (6, 6) that (n, 3) points give."""
+    return bool(_eigenvalues(points, H)[0] < 1.0 / OPEN_SIGMA**2)
+
+
 def is_imu_to_blame(registration: Registration) -> bool:
     """Whether a scan contradicts the IMU and shows so many planes that the IMU is the likelier culprit."""
-    enough = registration.inliers >= ENOUGH_SHARE * registration.used
+    enough = registration.inliers >= MANY_PLANES * registration.used
     return registration.surprise > SURPRISING and enough
 
 
@@ -174,15 +179,20 @@ def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, m
         points: (n, 3) m, LiDAR frame. H: (6, 6) information of the scan alone on rotation (rad) and position (m).
         stats: (2,) number of inliers, and the sum of their squared residuals in m².
     """
-    reach = float(np.sqrt(np.square(points, dtype=np.float64).sum() / len(points)))
-    scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
-    eigenvalues = np.linalg.eigvalsh(H * np.outer(scale, scale))
+    eigenvalues = _eigenvalues(points, H)
     degenerate = bool(eigenvalues[0] < 1.0 / DEGENERATE_SIGMA**2)
     reason = "this scan leaves one direction unobserved" if degenerate else ""
     rms = float(np.sqrt(stats[1] / stats[0]))
     return Registration(
         converged, iterations, len(points), int(stats[0]), rms, eigenvalues, degenerate, reason, matches
     )
+
+
+def _eigenvalues(points: F32, H: F64) -> F64:
+    """(6,) ascending, 1/m²: of H, as in `outcome`, with rotation scaled to metres by the RMS range of the points."""
+    reach = float(np.sqrt(np.square(points, dtype=np.float64).sum() / len(points)))
+    scale = np.r_[np.full(3, 1.0 / reach), np.ones(3)]
+    return np.linalg.eigvalsh(H * np.outer(scale, scale))
 
 
 def matches(points: F32, residuals: F64, planes: Planes) -> Matches:

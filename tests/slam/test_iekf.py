@@ -10,7 +10,7 @@ from app.slam.iekf import boxminus, boxplus
 from app.slam.imu import DIM, POS, ROT, VEL, Belief
 from app.slam.local_map import LocalMap
 from app.slam.sections import FilterParams, MapParams
-from app.slam.types import NavState
+from app.slam.types import F32, NavState
 
 from .scenes import Rig, Scene, box, furnished_room, pose_error
 from .updates import correlated_prior, points_of, surveyed, truth, uncertain
@@ -212,35 +212,45 @@ def test_points_along_the_cone_of_a_scan_line_do_not_hold_the_heading(room: Loca
     assert registration.inliers == 0
 
 
-def footpath() -> LocalMap:
-    """Two scan lines 0.1 m apart, whose normal across them is good to some two degrees; they lead to a wide floor."""
-    rng = np.random.default_rng(1)
-    path, floor = (
-        np.stack(np.meshgrid(x, y, [-1.3]), axis=-1).reshape(-1, 3)
-        for x, y in ((np.arange(-4.0, 4.0, 0.15), (0.0, 0.1)), (np.arange(6.0, 10.0, 0.3), np.arange(-2.0, 2.0, 0.3)))
+def park(seed: int) -> F32:
+    """(n, 3) m: a floor 1.3 m below the scanner, and eight trunks around it, seen to 1 cm."""
+    rng = np.random.default_rng(seed)
+    floor = np.column_stack([rng.uniform(-8.0, 8.0, (4000, 2)), np.full(4000, -1.3)])
+    around = 2 * np.pi * np.arange(8)[:, None] / 8
+    towards = around + np.pi + rng.uniform(-1.2, 1.2, (8, 40))  # only the side that the scanner sees
+    trunks = np.stack(
+        [
+            6.0 * np.cos(around) + 0.15 * np.cos(towards),
+            6.0 * np.sin(around) + 0.15 * np.sin(towards),
+            rng.uniform(-1.2, 1.5, (8, 40)),
+        ],
+        axis=-1,
     )
-    points = np.concatenate([path, floor])
-    points[:, 2] += rng.normal(scale=0.01, size=len(points))
-    params = MapParams(spacing=0.05)
-    local_map = LocalMap(params)
-    local_map.insert(points.astype(np.float32), np.zeros(3), params)
-    return local_map
+    points = np.concatenate([floor, trunks.reshape(-1, 3)])
+    return (points + rng.normal(scale=0.01, size=points.shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize(("speed", "used"), [(0.0, False), (1.0, True)])
-def test_poor_planes_are_used_where_good_ones_are_few_but_only_under_way(speed: float, used: bool) -> None:
-    floor = footpath()
-    rng = np.random.default_rng(2)
-    points = rng.uniform((-3.0, 0.0, -1.3), (3.0, 0.1, -1.3), (400, 3))
-    points[::4] = rng.uniform((7.0, -1.0, -1.3), (9.0, 1.0, -1.3), (100, 3))
+def test_where_good_planes_leave_a_direction_open_poor_ones_hold_the_scanner() -> None:
+    local_map = LocalMap(MapParams())
+    for seed in range(8):
+        local_map.insert(park(seed), np.zeros(3), MapParams())
+    seen = park(9)[::4]
+    good, _ = local_map.planes(seen.astype(float), np.zeros(3), FilterParams())
+    assert np.abs(good.normals[good.variances >= 0.0, 2]).min() > 0.9, "a trunk has a good plane"
     level = replace(
-        truth(),
-        **{"R_odom_imu": np.eye(3), "R_imu_lidar": np.eye(3), "p_odom_imu": np.zeros(3), "p_imu_lidar": np.zeros(3)},
-        v_odom_imu=np.array([speed, 0.0, 0.0]),
+        truth(), R_odom_imu=np.eye(3), R_imu_lidar=np.eye(3), p_odom_imu=np.zeros(3), p_imu_lidar=np.zeros(3)
     )
-    good = np.count_nonzero(floor.planes(points, np.zeros(3), FilterParams())[0].variances >= 0)
-    assert iekf.ENOUGH_PLANES < good < iekf.ENOUGH_SHARE * len(points)
-    _, registration = iekf.update(
-        Belief(level, uncertain(1e-2, 1e-2)), points.astype(np.float32), floor, FilterParams()
+    off = np.zeros(DIM)
+    off[POS] = 0.06, -0.08, 0.0
+    posterior, _ = iekf.update(Belief(boxplus(level, off), uncertain(1e-2, 1e-1)), seen, local_map, FilterParams())
+    assert np.linalg.norm(posterior.state.p_odom_imu) < 0.02
+
+
+def test_where_good_planes_hold_the_scanner_poor_ones_are_not_used(room: LocalMap) -> None:
+    points, state = points_of(furnished_room()), truth()
+    world = (points @ state.R_imu_lidar.T + state.p_imu_lidar) @ state.R_odom_imu.T + state.p_odom_imu
+    good, poor = (
+        np.count_nonzero(planes.variances >= 0.0) for planes in room.planes(world, state.p_odom_lidar, FilterParams())
     )
-    assert (registration.inliers > good + 100) == used
+    _, registration = iekf.update(Belief(state, uncertain(1e-3, 1e-3)), points, room, FilterParams())
+    assert registration.inliers <= good < poor

@@ -142,8 +142,7 @@ BEHIND = 0.15
 faces some centimetres apart, and a scan of one must not be fitted to the other. Closer to edge-on, the side is not
 sure."""
 SHARED = 4.0
-"""Weight of a plane's own variance, and of its normal's: points on the same patch share its error, so it does not
-average out between them."""
+"""Weight of a plane's own variance: points on the same patch share its error, which does not average out."""
 OLD = 4.0
 """Weight of an old plane's variance: odometry has drifted since, and the pose is to return to it smoothly."""
 
@@ -244,7 +243,7 @@ def _fit(x, y, z, eye, places, order, n, first, flat, tilts, noise, normal, j, n
                 variances[i, j] = (noise * noise + SHARED * l3) * doubt
                 _deviate(
                     xx * s - mx * mx, xy * s - mx * my, xz * s - mx * mz, yy * s - my * my, yz * s - my * mz,
-                    zz * s - mz * mz, SHARED * scatter * s, normal, deviations[i, j],
+                    zz * s - mz * mz, scatter * s, normal, deviations[i, j],
                 )  # fmt: skip
         if level == len(tilts) or take == n:
             break
