@@ -89,7 +89,6 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     converged, iteration, sure = False, 0, True
 
     def accumulate(planes: Planes) -> None:
-        R, p, R_il, p_il = x[0:9].reshape(3, 3), x[9:12], x[24:33].reshape(3, 3), x[33:36]
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
             planes.deviations, params.gate, H, b, stats, residuals,

@@ -210,7 +210,7 @@ def write(path: Path, entries: list[Entry], container: str = "mcap") -> Path:
     but the bags are folders), bare-mcap, bare-db3, small-chunks (a bare .mcap of many zstd chunks).
     """
     if container == "small-chunks":
-        return _write_small_chunks(path.with_suffix(".mcap"), entries)
+        return write_mcap(path.with_suffix(".mcap"), entries)
     if container.startswith("bag"):
         path = path.with_suffix(".bag")
         writer: Any = Writer1(path)
@@ -231,9 +231,13 @@ def write(path: Path, entries: list[Entry], container: str = "mcap") -> Path:
     return path
 
 
-def _write_small_chunks(path: Path, entries: list[Entry]) -> Path:
+def write_mcap(path: Path, entries: list[Entry], *, counts: bool = True, **options: Any) -> Path:
+    """A bare .mcap of many chunks.
+
+    counts: tell how many messages each topic has. options: of mcap's writer.
+    """
     with path.open("wb") as stream:
-        writer = McapWriter(stream, chunk_size=30_000)
+        writer: Any = McapWriter(stream, **{"chunk_size": 30_000, **options})
         writer.start(profile="ros2")
         channels: dict[str, int] = {}
         for topic, log_ns, sent in entries:
@@ -244,6 +248,8 @@ def _write_small_chunks(path: Path, entries: list[Entry]) -> Path:
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             data = bytes(TYPESTORES[2].serialize_cdr(sent, kind))
             writer.add_message(channels[topic], log_ns, data, publish_time=log_ns)
+        if not counts:
+            writer._Writer__statistics.channel_message_counts.clear()
         writer.finish()
     return path
 

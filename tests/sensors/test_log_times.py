@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer as McapWriter
 
 from app.sensors import log_times
 from app.sensors.findings import Finding
@@ -29,28 +28,10 @@ def walk(wrong: Wrong, ros: int = 2) -> list[rig.Entry]:
     return entries
 
 
-def unindexed(path: Path, entries: list[rig.Entry], chunking: bool) -> Path:
-    """An .mcap without chunks, or with one for each message."""
-    with path.open("wb") as stream:
-        writer = McapWriter(stream, chunk_size=1, use_chunking=chunking)
-        writer.start(profile="ros2")
-        channels: dict[str, int] = {}
-        for topic, log_ns, sent in entries:
-            kind = sent.__msgtype__
-            if topic not in channels:
-                text = rig.TYPESTORES[2].generate_msgdef(kind, ros_version=2)[0]
-                schema = writer.register_schema(kind, "ros2msg", text.encode())
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            data = bytes(rig.TYPESTORES[2].serialize_cdr(sent, kind))
-            writer.add_message(channels[topic], log_ns, data, publish_time=log_ns)
-        writer.finish()
-    return path
-
-
 def written(path: Path, container: str, wrong: Wrong) -> Path:
     entries = walk(wrong, 1 if container == "bag" else 2)
     if container in ("unchunked", "single"):
-        return unindexed(path.with_suffix(".mcap"), entries, container == "single")
+        return rig.write_mcap(path.with_suffix(".mcap"), entries, chunk_size=1, use_chunking=container == "single")
     return rig.write(path, entries, container)
 
 
@@ -93,14 +74,15 @@ def test_messages_that_were_written_in_another_order_are_no_damage(tmp_path: Pat
     entries = walk([])
     entries[400:402] = entries[401], entries[400]
     path = tmp_path / "walk.mcap"
-    path = rig.write(path, entries, container) if container != "unchunked" else unindexed(path, entries, False)
+    unchunked = container == "unchunked"
+    path = rig.write_mcap(path, entries, use_chunking=False) if unchunked else rig.write(path, entries, container)
     assert read(path)[1:] == (TURNS, 40, [])
 
 
 def test_the_latest_log_time_that_an_mcap_can_hold_is_wild_too(tmp_path: Path) -> None:
     entries = walk([])
     topic, _, sent = entries.pop()
-    path = unindexed(tmp_path / "walk.mcap", [*entries, (topic, 2**64 - 1, sent)], chunking=True)
+    path = rig.write_mcap(tmp_path / "walk.mcap", [*entries, (topic, 2**64 - 1, sent)], chunk_size=1)
     assert read(path)[:3] == (pytest.approx(TURNS / 10, abs=0.2), TURNS, 40)
 
 
