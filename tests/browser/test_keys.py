@@ -81,6 +81,30 @@ def test_a_click_right_after_typing_takes_all_that_was_typed(bench: Bench) -> No
     page.get_by_role("tab", name="Parameters").click()
 
 
+def test_a_click_on_a_busy_page_takes_all_that_was_typed(bench: Bench) -> None:
+    page = bench.page
+    page.get_by_role("tab", name="Recording").click()
+    button = page.get_by_role("button", name="Add note")
+    bench.engine.sent.clear()
+    button.evaluate(
+        """async (button) => {
+          const boxes = [...document.querySelectorAll('input')];
+          const box = boxes.findLast((one) => one.compareDocumentPosition(button) & Node.DOCUMENT_POSITION_FOLLOWING);
+          const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set;
+          const busy = (ms) => { for (const end = performance.now() + ms; performance.now() < end;); };
+          for (const text of ['d', 'damp', 'damp wall']) {
+            set.call(box, text);
+            box.dispatchEvent(new Event('input', {bubbles: true}));
+            await null;
+          }
+          busy(100); // viser's timer is late
+          button.click();
+        }"""
+    )
+    bench.eventually(lambda: bench.engine.sent == [AddNote("damp wall")], 20)
+    page.get_by_role("tab", name="Parameters").click()
+
+
 def test_enter_in_a_dialog_does_what_its_button_says_with_all_that_was_typed(bench: Bench) -> None:
     page = bench.page
     bench.next_frame()

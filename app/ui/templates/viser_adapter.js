@@ -4,7 +4,7 @@ if (!window.hemislamSay) {
   // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, of
   // all controls together. So a word waits until nothing has changed for as long, not even by the word before; of two
   // words that ask for the same thing the later one counts, but every press that asks for a step does. On a busy page
-  // viser's timer may be late and run after ours, but it has run by the time of a further timer, which is set only then.
+  // viser's timer may be late and run after ours. It has run by the time of a further timer that ours sets, no sooner.
   const QUIET_MS = 60;
   let said = 0, presses = 0, sending = 0, changed = -QUIET_MS;
   const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set, waiting = new Map();
@@ -34,17 +34,17 @@ if (!window.hemislamSay) {
     if (event.detail > 1 && /^(delete|drop) /.test(word)) return; // of a double click, the second one meets the next line
     const [kind] = word.split(' '), press = kind === 'step' && !event.held ? ++presses : '';
     waiting.set(`${name} ${kind} ${press}`, [name, word]);
-    if (!sending) send(false);
+    if (!sending) sending = setTimeout(send);
   };
 
   // For the same reason a click on one of viser's buttons waits until what was typed before it has been sent.
-  let typed = -QUIET_MS;
+  let typed = 0;
   document.addEventListener('input', () => { typed = performance.now(); }, true);
   document.addEventListener('click', (event) => {
     const button = event.target.closest('.mantine-Button-root'), rest = typed + QUIET_MS - performance.now();
-    if (!button || rest <= 0) return;
+    if (!button || !typed) return;
     event.stopImmediatePropagation();
-    setTimeout(() => button.click(), rest);
+    setTimeout(() => setTimeout(() => { typed = 0; button.click(); }), Math.max(rest, 0));
   }, true);
 
   // On a phone the panel is low, its tabs alone, until one is tapped; the same one lowers it again.
