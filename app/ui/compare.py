@@ -131,7 +131,7 @@ class ComparePanel:
         self._scene_changes, self._pair_changes = Changes(page.now, SCENE_PERIOD_S), Changes()
         self._panel_changes = Changes(page.now, PANEL_PERIOD_S)
 
-        self._status = gui.add_html(panel("no_fork"))
+        self._status = gui.add_html(panel("no_fork", False))
         self._name = gui.add_text("name", "", hint="Of the fork, and of its file when you keep it.")
         hint = "Continue from this frame with other parameters, side by side."
         self._fork = add_button(gui, "Fork here", lambda _: self._begin(), viser.Icon.GIT_BRANCH, color=None, hint=hint)
@@ -173,6 +173,7 @@ class ComparePanel:
         b = self._forks.other
         self._sides.draw(b)
         self._fork.visible = self._open.visible = b is None
+        self._fork.disabled = self._open.disabled = a.live is not None
         self._what.visible = self._by_ground.visible = self._comparison.visible = b is not None
         if b is None:
             self._recent.clear()

@@ -134,7 +134,7 @@ def thinned(stamps: F64, *columns: F64) -> tuple[F64, ...]:
 def status(a: Snapshot, b: Snapshot | None, names: tuple[str, str], forked_at: int) -> str:
     """Who A and B are, and how B is doing; without a fork, what one is for."""
     if b is None:
-        return panel("no_fork")
+        return panel("no_fork", a.live is not None)
     return panel("fork", names, forked_at, (A_COLOUR, B_COLOUR), *how(a, b))
 
 

@@ -134,7 +134,8 @@ def where(snapshot: Snapshot) -> str:
         number(transport.frames_per_second, 1) if transport.playing else "",
     )
     if snapshot.live is not None:
-        forward = "A live session only goes forward. To go back, record it (--record) and open the file."
+        back = "start with --record" if snapshot.live.recorded is None else "open what is recorded, once it has ended"
+        forward = f"A live session only goes forward. To go back, {back}."
         if transport.frame < 0:
             return panel("quiet", f"Waiting for the first scan. {forward}")
         dropped = f"{transport.dropped:,} scans dropped" if transport.dropped else "no scan dropped"

@@ -33,7 +33,7 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
 LENGTH_S = 4.0
-BUSY = "the engine was too busy"
+BUSY = "too many scans waited"
 
 
 class Script:

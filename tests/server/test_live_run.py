@@ -232,7 +232,7 @@ def test_scans_that_an_engine_is_too_slow_for_are_dropped_counted_and_reported(l
     assert end.transport.dropped == live.onlooker.state().counters.dropped >= 5
     assert live.onlooker.state().counters.imu_lost == 0
     assert end.series["dropped"].sum() == end.transport.dropped, "the timeline draws them"
-    assert any("too busy" in notice.text for notice in end.notices)
+    assert any("too many scans waited" in notice.text for notice in end.notices)
 
 
 def test_there_is_no_going_back_live_and_it_is_said(live: Live) -> None:

@@ -13,6 +13,7 @@ import pytest
 import viser
 from scipy.spatial.transform import Rotation
 
+from app.sensors.live.status import LiveState
 from app.server.folders import Folders
 from app.server.fork import Workspace
 from app.server.protocol import Notice, Progress, Saved, Seek, SetParams, Snapshot, StepFrame
@@ -162,6 +163,16 @@ def test_without_a_fork_the_page_says_what_one_is_for(page: Page, wire: Wire) ->
     wire.clear()
     page.draw()
     assert wire.messages == []
+
+
+def test_a_live_source_cannot_be_forked_and_the_page_says_what_to_do(page: Page, engine: FakeEngine) -> None:
+    engine.publish(live=LiveState())
+    page.draw()
+    assert page.panel._fork.disabled and page.panel._open.disabled
+    assert "fork its recording" in page.panel._status.content
+    engine.publish(live=None)
+    page.draw()
+    assert not page.panel._fork.disabled and not page.panel._open.disabled
 
 
 def test_a_fork_is_asked_for_and_what_is_set_next_is_set_in_it(page: Page) -> None:

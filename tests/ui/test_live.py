@@ -137,6 +137,8 @@ def test_a_live_session_cannot_go_back_and_the_page_says_why(server: viser.Viser
     live = replace(engine.snapshot, live=WELL)
     panel.draw(live)
     assert state(live)["live"] and state(live)["open"]
+    assert "--record" not in panel._state.content, "it is recorded already"
+    panel.draw(replace(live, live=replace(WELL, recorded=None)))
     assert "--record" in panel._state.content
     panel.draw(engine.snapshot)
     assert not state(engine.snapshot)["live"]

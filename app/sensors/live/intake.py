@@ -50,7 +50,8 @@ _TOO_FAST_SAMPLES = 20
 """So many in turn that are too fast are no knock."""
 _AHEAD_NS, _LATE_NS = -50_000_000, 2_000_000_000
 """Stamps whose age on arrival is between these are taken as the time of day."""
-BUSY, NO_IMU = "the engine was too busy", "no IMU sample came to cover it"
+BUSY = "too many scans waited (mapping was paused, or slower than the scanner)"
+NO_IMU = "no IMU sample came to cover it"
 
 Clock = Literal["auto", "sensor", "host"]
 

@@ -32,7 +32,7 @@ class Counters:
     foreign: packets of another sensor. truncated: packets cut short. strays: packets whose time no other confirms.
     undated: packets without a date, stamped on arrival. bad_blocks: blocks of a packet without their mark.
     imu, imu_lost, imu_late, imu_foreign: datagrams or messages of the IMU.
-    jumps: of a sensor's clock. dropped: scans that the engine was too busy for.
+    jumps: of a sensor's clock. dropped: scans that had to wait for too long.
     reconnects: of a connection. unreadable: messages that could not be decoded.
     restarts: of the receiving process.
     """
