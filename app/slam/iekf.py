@@ -99,12 +99,14 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
         if planes is None or _over(since_search, RESEARCH_ROTATION, RESEARCH_TRANSLATION):
             kernels.to_world(points, R, p, R_il, p_il, world)
             good, poor = local_map.planes(world, R @ p_il + p, params)
-            if sure:
-                accumulate(good)
-                sure = stats[0] >= MIN_INLIERS and not is_open(points, H)
             planes = good if sure else poor
+            accumulate(planes)
+            if sure and (stats[0] < MIN_INLIERS or is_open(points, H)):
+                sure, planes = False, poor
+                accumulate(planes)
             since_search[:] = 0.0
-        accumulate(planes)
+        else:
+            accumulate(planes)
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
         H, b = _nonnegative(H, b)
