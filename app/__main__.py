@@ -1,4 +1,4 @@
-"""The command line: the only place that wires the rooms together. It imports them when they are needed."""
+"""The command line: the only place that wires the packages together. It imports each when it is needed."""
 
 import contextlib
 import gc
