@@ -13,7 +13,7 @@ _ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
 """On a dark and on a light background."""
 _LAYERS: Final = (
     ("map", "map", "Points of the keyframes."),
-    ("moving", "moving things", "Points on people and whatever else moved, found once later keyframes see through."),
+    ("moving", "moving points", "Points on people and other moving objects, found once later keyframes see through them."),
     ("scan", "scan", "Points of the newest frame."),
     ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
     ("plane", "ground plane", "The plane through the seeds."),
@@ -126,5 +126,5 @@ class AppearancePanel:
         colours = legend(by, limits, view.ends) if view.map or view.scan else ""
         self._legend.content = panel("legend", colours, lines, view.grid)
         words = f"{points:,} map points are drawn; of more than {budget:,}, mainly those near the camera."
-        about = f" {moving:,} points on moving things are {'shown' if view.moving else 'hidden'}." if moving else ""
+        about = f" {moving:,} moving points are {'shown' if view.moving else 'hidden'}." if moving else ""
         self._count.content = panel("note", f"{words} The engine keeps the whole map.{about}")

@@ -255,7 +255,7 @@ class FilesPanel:
                 "inside the clip box", clip.on, visible=clip.box is not None, hint="Only points that are in it."
             )
             moving = gui.add_checkbox(
-                "with what moves", True, hint="Marked in PLY, PCD, LAS and LAZ; the other formats leave it out."
+                "with moving points", True, hint="Marked in PLY, PCD, LAS and LAZ; other formats omit them."
             )
             problem = gui.add_html("", visible=False)
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
