@@ -13,7 +13,11 @@ _ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
 """On a dark and on a light background."""
 _LAYERS: Final = (
     ("map", "map", "Points of the keyframes."),
-    ("moving", "moving points", "Points on people and other moving objects, found once later keyframes see through them."),
+    (
+        "moving",
+        "moving points",
+        "Points on people and other moving objects, found once later keyframes see through them.",
+    ),
     ("scan", "scan", "Points of the newest frame."),
     ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
     ("plane", "ground plane", "The plane through the seeds."),
