@@ -95,7 +95,7 @@ def main() -> None:
             tab(page, "Loops")
             page.get_by_role("button", name="Diagnostics").click()
             page.locator("tr[data-hs]").first.click()
-            page.get_by_text("Points over their distance").wait_for()
+            page.get_by_text("Histogram of the points' distances").wait_for()
             page.get_by_role("button", name="fly there").click()
             shoot(page, "loops")
             page.get_by_role("button", name="close").click()

@@ -19,10 +19,10 @@ _LAYERS: Final = (
         "Points on people and other moving objects, found once later keyframes see through them.",
     ),
     ("scan", "scan", "Points of the newest frame."),
-    ("wedge", "seed wedge", "Where seeds are looked for: within α of straight down, on the M outermost lines."),
+    ("wedge", "seed wedge", "Where the engine looks for seeds: within α of straight down, on the M outermost lines."),
     ("plane", "ground plane", "The plane through the seeds."),
     ("path", "path, truth", "The sensor's trajectory, and the truth when it is loaded."),
-    ("notes", "notes", "Pinned where the sensor was when they were taken. A click goes to that frame."),
+    ("notes", "notes", "Pinned where the sensor was at that frame. A click goes to the frame."),
     ("grid", "grid", "1 m cells on the ground below the sensor."),
 )
 
@@ -46,7 +46,7 @@ class AppearancePanel:
         self._limits: Limits | None = None  # of all values
         self._ends: dict[str, Limits] = {}  # by colour mode, as the user chose them
         self._colour_by = gui.add_dropdown(
-            "colour by", COLOUR_BY, initial_value=default.colour_by, hint="What colours mean. C: the next."
+            "colour by", COLOUR_BY, initial_value=default.colour_by, hint="Meaning of the colours. C: next mode."
         )
         self._light = gui.add_checkbox("light theme", False, hint="For bright rooms and for print.")
         self._light.on_update(lambda _: apply_theme(gui, light=self._light.value))
@@ -67,13 +67,13 @@ class AppearancePanel:
             self._ceilings = gui.add_dropdown(
                 "ceilings",
                 (_BY_ITSELF, _SHOWN, _HIDDEN),
-                hint="From above they would hide what is below them. Ceilings labelled ground always stay.",
+                hint="Seen from above, ceilings hide the rooms below them. Ceilings labelled ground always stay.",
             )
             self._layers = {
                 name: gui.add_checkbox(text, getattr(default, name), hint=hint) for name, text, hint in _LAYERS
             }
         self._count = gui.add_html("")
-        following = "Follow the sensor or look freely"
+        following = "Follow the sensor or move freely"
         add_command(gui, following, lambda _: show(self._follow, not self._follow.value), hotkey="F")
         add_command(gui, "Next colour mode", lambda _: choose_next(self._colour_by), hotkey="C")
 
@@ -116,7 +116,7 @@ class AppearancePanel:
         """Stop following, and say so if it was on."""
         if self._follow.value:
             show(self._follow, False)
-            client.add_notification("Follow is off", "So the view stays here. F follows the sensor again.")
+            client.add_notification("Follow is off", "The view stays here. F follows the sensor again.")
 
     def draw(
         self, view: View, limits: Limits | None, lines: list[tuple[Rgb, str]], points: int, moving: int, budget: int

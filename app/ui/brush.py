@@ -42,7 +42,7 @@ class BrushPanel:
             "brush", (*_MARKS, _OFF), hint="Pause, then click points of the scan; Shift and drag marks a rectangle."
         )
         self._radius = gui.add_slider("radius (m)", 0.05, 3.0, 0.05, 0.4)
-        hint = "Points of this frame without a mark take the label that the engine gave them; then correct these."
+        hint = "Unmarked points of this frame get the engine's labels as marks; then correct these."
         self._rest = add_button(gui, "Mark the rest as labelled", lambda _: self._mark_rest(), hint=hint)
         self._undo = add_button(
             gui, "Undo mark", lambda _: page.send(UndoPaint()), viser.Icon.ARROW_BACK_UP, visible=False

@@ -23,12 +23,12 @@ from app.ui.html import panel
 from app.ui.widgets import Page, add_button
 
 _EXPLAINED = (
-    "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and what each scan line gets "
-    "wrong, from the recording alone. Takes about as long as the recording."
+    "Finds rotation and position of the LiDAR on the IMU, the offset of their clocks, and the errors of each scan "
+    "line, from the recording alone. Takes about as long as the recording."
 )
-_APPLIES = "Use these parameters, keep them beside the recording, and read it again."
-_UNDOES = "Use the parameters from before, undo what is kept beside the recording, and read it again."
-_KEEPS = "Keep these parameters beside the recording, for whenever it is opened. Undo takes that back."
+_APPLIES = "Use these parameters, save them beside the recording, and read the recording again."
+_UNDOES = "Restore the earlier parameters and the file beside the recording, and read the recording again."
+_KEEPS = "Save these parameters beside the recording, so that they apply whenever it is opened. Undo reverts this."
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class CalibrationPanel:
         self._page, self._unasked, self._resolve = page, unasked, resolve
         gui = page.gui
         self._button = add_button(gui, "Calibrate", lambda _: self._begin(), color=None, hint=_EXPLAINED, disabled=True)
-        self._work = Background(gui, "calibrate", "Calibration", "What was found before stays.")
+        self._work = Background(gui, "calibrate", "Calibration", "Earlier results stay.")
         self._html = gui.add_html("", visible=False)
         self._apply = add_button(gui, "Apply", lambda _: self._apply_or_undo(), color=None, visible=False)
         self._keep = add_button(gui, "Keep", lambda _: self._write(), hint=_KEEPS, visible=False)
@@ -128,7 +128,7 @@ class CalibrationPanel:
                 self._notified.add(number)
                 client.add_notification(
                     "Looking for the pose of the LiDAR on the IMU",
-                    "None is given. The map may look wrong until it is found; then it is made again.",
+                    "None is given. The map may look wrong until the pose is found; then the map is rebuilt.",
                     auto_close_seconds=20.0,
                 )
 
@@ -192,7 +192,7 @@ class CalibrationPanel:
         try:
             self._file = path.read_bytes() if path.is_file() else None
             write_beside(self._of, self._found.values)
-            self._tell(("kept", f"in {path}, for whenever this recording is opened"))
+            self._tell(("kept", f"in {path}; applied whenever this recording is opened"))
         except (HemislamError, OSError) as error:
             self._keep.visible = True
             self._tell(("not kept", str(error)))

@@ -239,17 +239,17 @@ class CameraPanel:
         ways = gui.add_button_group(
             "camera",
             (FIT, *_WAYS),
-            hint="The whole map, also while it grows; G fits it from the same side. A plan is orthographic, north up.",
+            hint="Show the whole map, even as it grows; G fits it from the same side. Plan: orthographic, north up.",
         )
         ways.on_click(by_user(self.look))
         lenses = gui.add_button_group(
             "lens", tuple(_LENSES), hint="Orthographic: parallel lines stay parallel, and lengths can be compared."
         )
         lenses.on_click(by_user(self._choose_lens))
-        hint = f"In the session, which holds the newest {MOST_VIEWS}."
+        hint = f"Saved in the session, which keeps the newest {MOST_VIEWS}."
         add_button(gui, "Keep this view", self._keep, viser.Icon.BOOKMARK, hint=hint)
         self._list = gui.add_button_group(
-            "kept views", ("1",), visible=False, hint="Go back to a view that was kept in this session."
+            "kept views", ("1",), visible=False, hint="Return to a view that was saved in this session."
         )
         self._list.on_click(by_user(lambda name, client: self._return(client, int(name) - 1)))
         add_command(gui, "Frame the whole map", lambda client: self.look(FIT, client), hotkey="G")

@@ -66,21 +66,23 @@ class ClipPanel:
             self._size = limited(gui.add_vector3("size (m)", (1.0,) * 3, min=(0.05,) * 3, max=(_FAR_M,) * 3, step=0.05))
             self._turn = limited(gui.add_number("turn (°)", 0.0, min=-360.0, max=360.0, step=1.0))
             self._turn.precision = 2  # viser would take it from the step, and cut 12.5 to 12
-            self._pull = gui.add_checkbox("handles", True, hint="Arrows move the sides, the one in the middle the box.")
+            self._pull = gui.add_checkbox(
+                "handles", True, hint="The arrows move the sides; the handle in the middle moves the box."
+            )
             add_button(gui, "Look from its front", self.look, viser.Icon.VIEWPORT_NARROW)
             save = viser.Icon.DEVICE_FLOPPY
             add_button(gui, "Save as a section…", lambda client: ask_where(client, "section"), save)
             add_button(gui, "Around the whole map", lambda _: self._send(box=self._whole()), viser.Icon.MAXIMIZE)
         self._slab = limited(
             gui.add_number(
-                "slab (m)", 1.0, min=0.05, max=100.0, step=0.05, hint="How thick a cut section or the profile is."
+                "slab (m)", 1.0, min=0.05, max=100.0, step=0.05, hint="Thickness of a cut section or of the profile."
             )
         )
-        hint = "Click two points: the clip box becomes the slab between."
+        hint = "Click two points: the clip box becomes the slab between them."
         add_button(gui, "Cut by two clicks", self._begin_cut, viser.Icon.SLICE, hint=hint)
         self._asked = gui.add_html("", visible=False)
         self._unrolled = gui.add_checkbox(
-            "profile", False, hint="The map along the walked path: to the right the way walked, up the height."
+            "profile", False, hint="The map along the walked path: distance walked to the right, height up."
         )
         self._save_profile = add_button(
             gui, "Save the profile…", lambda client: ask_where(client, "profile"), save, visible=False
@@ -131,7 +133,7 @@ class ClipPanel:
         """The box around all of the map but a few far points. Raises HemislamError: there is no map yet."""
         points = self._around()
         if not len(points):
-            raise HemislamError("There is no map yet that could be clipped; play the recording first.")
+            raise HemislamError("There is no map yet to clip; play the recording first.")
         low, high = np.percentile(points, (0.5, 99.5), axis=0)
         return Box.around((low + high) / 2, np.maximum(high - low, 1.0) + 0.1)
 

@@ -47,7 +47,11 @@ class Sides:
     def __init__(self, gui: viser.GuiApi, forks: Workspace) -> None:
         self._forks = forks
         self._choice = gui.add_dropdown(
-            "act on", ("A", "B"), initial_value="A", visible=False, hint="Whose parameters these are. T changes it."
+            "act on",
+            ("A", "B"),
+            initial_value="A",
+            visible=False,
+            hint="Whose parameters are shown and changed. T switches.",
         )
         add_command(gui, "Parameters of A or of its fork B", lambda _: self._other(), hotkey="T")
 
@@ -132,14 +136,14 @@ class ComparePanel:
         self._panel_changes = Changes(page.now, PANEL_PERIOD_S)
 
         self._status = gui.add_html(panel("no_fork", False))
-        self._name = gui.add_text("name", "", hint="Of the fork, and of its file when you keep it.")
+        self._name = gui.add_text("name", "", hint="Name of the fork, and of its file if you keep it.")
         hint = "Continue from this frame with other parameters, side by side."
         self._fork = add_button(gui, "Fork here", lambda _: self._begin(), viser.Icon.GIT_BRANCH, color=None, hint=hint)
         hint = "A kept fork or an older session, beside A."
         self._open = add_button(gui, "Open as B…", self._choose, viser.Icon.FOLDER_OPEN, hint=hint)
-        hint = "X swaps. Keep: as a file that can be opened again."
+        hint = "X swaps. Keep saves a file that can be opened again."
         self._what = gui.add_button_group("fork", (_SWAP, _KEEP, _DISCARD), visible=False, hint=hint)
-        hint = "Colour the scan by who calls its points ground."
+        hint = "Colour the scan by whether A, B or both label a point ground."
         self._by_ground = gui.add_checkbox("ground: A against B", True, visible=False, hint=hint)
         self._comparison = gui.add_folder(None, visible=False)
         with self._comparison:

@@ -147,7 +147,7 @@ def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
     if b.recording is None:
         return "B is starting …", WARN
     if not same_recording(a, b):
-        return "A has opened another recording; B stays where it is.", WARN
+        return "A has opened another recording; B stays at its frame.", WARN
     behind = a.transport.frame - b.transport.frame
     unsaved = {saved.error for saved in b.saved}  # a save that failed is no trouble of B's
     errors = [one.text for one in b.notices if one.level == "error" and one.text not in unsaved]

@@ -166,7 +166,7 @@ class FilesPanel:
             self._browse_trajectories,
             viser.Icon.ROUTE,
             disabled=True,
-            hint="Draw the truth, or what another run or program made of this recording, beside the trajectory, and "
+            hint="Draw the truth, or the result of another run or program, beside the trajectory, and "
             "plot the distance to it.",
         )
         self._save = add_button(gui, "Save results…", self.ask_where, viser.Icon.DEVICE_FLOPPY, disabled=True)
@@ -239,7 +239,7 @@ class FilesPanel:
                 "files",
                 (_OF_A_RUN, *_FORMATS),
                 initial_value=titles.get(format, _OF_A_RUN),
-                hint="Those of a run, or one in the format of other programs.",
+                hint="All files of a run, or one file for other programs.",
             )
             thin = limited(
                 gui.add_number(
@@ -252,7 +252,7 @@ class FilesPanel:
                 )
             )
             boxed = gui.add_checkbox(
-                "inside the clip box", clip.on, visible=clip.box is not None, hint="Only points that are in it."
+                "inside the clip box", clip.on, visible=clip.box is not None, hint="Only points inside it."
             )
             moving = gui.add_checkbox(
                 "with moving points", True, hint="Marked in PLY, PCD, LAS and LAZ; other formats omit them."
@@ -265,7 +265,7 @@ class FilesPanel:
             try:
                 now = self._page.snapshot().recording
                 if now is None or now.path != recording.path:
-                    raise HemislamError("Another recording is open by now; cancel, and save its results anew.")
+                    raise HemislamError("Another recording is open now; cancel, and save its results instead.")
                 folder = self._results / folder_name(name.value)
                 choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
             except HemislamError as error:

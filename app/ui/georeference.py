@@ -61,18 +61,18 @@ class GeoreferencePanel:
                 icon=viser.Icon.UPLOAD,
                 color="gray",
                 mime_type=".csv,.txt,text/*",
-                hint="A table with a heading: name,E,N,H or name,latitude,longitude,height.",
+                hint="A CSV table with a header line: name,E,N,H or name,latitude,longitude,height.",
             )
         self._use = gui.add_dropdown("use them", (_ALIGN, _FACTORS), hint="As factors, fixes bend the map.")
-        self._crs = gui.add_text("grid", "", hint="EPSG:25832, for example; empty: the UTM zone of the place.")
+        self._crs = gui.add_text("grid", "", hint="EPSG:25832, for example; empty: the local UTM zone.")
         self._lever = gui.add_text(
             "lever arm (m)", "", hint="From the IMU to the antenna, in the IMU's axes: 0.05 -0.1 0.4; empty: estimated."
         )
         self._offset = gui.add_text(
-            "clock offset (ms)", "", hint="How much later fixes are stamped than measured; empty: estimated."
+            "clock offset (ms)", "", hint="Delay from the measurement of a fix to its stamp; empty: estimated."
         )
         self._height = gui.add_text(
-            "heights above", "", hint="The reference of the heights, for the files; empty: as in the fixes."
+            "heights above", "", hint="Height reference to name in the files; empty: as in the fixes."
         )
         self._lay = add_button(
             gui, "Georeference the map", lambda _: page.send(Georeference(self.survey())), viser.Icon.WORLD, color=None

@@ -24,7 +24,7 @@ _TROUBLES: Final = {
     "reordered": "packets put back in order",
     "late": "packets too late",
     "truncated": "packets cut short",
-    "strays": "with a time of their own",
+    "strays": "packets with stray times",
     "undated": "packets without a date",
     "bad_blocks": "bad blocks in packets",
     "imu_lost": "IMU samples lost",
@@ -103,7 +103,7 @@ class LivePanel:
     def __init__(self, page: Page) -> None:
         self._page = page
         self._html = page.gui.add_html("", visible=False)
-        hint = "Maps what the sensor sends from now on, in a new map. What --record writes has no gap."
+        hint = "Start a new map from the data that the sensor sends from now on. The file of --record has no gap."
         self._back = add_button(
             page.gui,
             "Back to the live source",

@@ -24,7 +24,7 @@ _BINS: Final = 41
 _LEAST_M: Final = 0.005
 """The colours cover at least this distance on either side."""
 _WHAT: Final = "How far each point of the map lies in front of the surface of another map, or behind it."
-_OLD: Final = "The map has changed since; what has no distance yet is grey. Compare again."
+_OLD: Final = "The map has changed since; points without a distance are grey. Compare again."
 
 
 class MapComparePanel:
@@ -47,7 +47,7 @@ class MapComparePanel:
         gui.add_html(panel("quiet", _WHAT))
         self._found = gui.add_html("", visible=False)
         self._choose = add_button(gui, "Choose a map…", self._browse, viser.Icon.FOLDER_OPEN, hint="PLY, LAS, LAZ.")
-        hint = "The same scans, put where the true trajectory has them."
+        hint = "The same scans, placed at the true poses."
         self._truth = add_button(
             gui, "The map by the truth", self._by_truth, viser.Icon.ROUTE, visible=False, hint=hint
         )
@@ -56,7 +56,12 @@ class MapComparePanel:
         )
         self._reach = limited(
             gui.add_number(
-                "reach (m)", REACH_M, min=0.05, max=5.0, step=0.05, hint="What is farther has no counterpart."
+                "reach (m)",
+                REACH_M,
+                min=0.05,
+                max=5.0,
+                step=0.05,
+                hint="Points farther apart than this have no counterpart.",
             )
         )
         self._work = Background(gui, "compare", "The comparison")

@@ -53,9 +53,11 @@ class MeasurePanel:
         self._asked = gui.add_html("", visible=False)
         self._bridge = Bridge(gui, "measures", self._act)
         self._list = gui.add_html("", visible=False)
-        self._name = gui.add_text("name", "", hint="Of the next measure; empty: a number.")
+        self._name = gui.add_text("name", "", hint="Name of the next measure; empty: a number.")
         self._snap = gui.add_checkbox(
-            "snap to corners", False, hint="A click near a corner means where the surfaces around meet; else an edge."
+            "snap to corners",
+            False,
+            hint="A click near a corner picks the point where surfaces meet; else a point on an edge.",
         )
         self._save = add_button(gui, "Download as CSV", self._download, viser.Icon.DOWNLOAD, visible=False)
 
@@ -148,7 +150,7 @@ class MeasurePanel:
         points = f"{left}{' more' if self._spots else ''} point{'s' if left > 1 else ''}"
         asked = f"{self._kind.capitalize()}: click {points} of the map." if left else ""
         if self.picking and not map_shown:
-            asked = "The map is hidden; show it to click its points."
+            asked = "The map is hidden; show it to click on points."
         self._asked.content, self._asked.visible = panel("text", asked), bool(asked)
         rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]
         waiting = f"{later} more on keyframes that the map does not hold now." if later else ""

@@ -34,7 +34,7 @@ class NotesPanel:
         self._pinned: list[tuple[int, str]] = []  # frame and text
         self._where: F64 = np.empty((0, 3))
         self._bridge = Bridge(page.gui, "notes", self._act)
-        self._text = page.gui.add_text("note", "", hint="On the frame that is shown; kept in the session.")
+        self._text = page.gui.add_text("note", "", hint="A note on the frame shown; kept in the session.")
         self._add = add_button(page.gui, "Add note", lambda _: self._note(), viser.Icon.NOTE)
         self._list = page.gui.add_html("", visible=False)
 
@@ -47,7 +47,7 @@ class NotesPanel:
     def _note(self) -> None:
         if self._text.value.strip():
             if self._page.snapshot().recording is None:
-                raise HemislamError("No recording is open that the note could be kept with; open one first.")
+                raise HemislamError("No recording is open to keep the note with; open one first.")
             self._page.send(AddNote(self._text.value))
             show(self._text, "")
 

@@ -62,7 +62,7 @@ TITLES: Final = {
     "imu": "IMU",
     "map": "Local map",
     "keyframe": "Keyframes",
-    "moving": "Moving things",
+    "moving": "Moving points",
     "loops": "Loop search",
 }
 """Of sections whose own names do not do."""
@@ -334,7 +334,7 @@ class ParameterPanel:
     def _add_reset(self, group: str) -> None:
         """A button for each parameter of the group that was changed since the recording was opened, and one for all."""
         buttons = self._gui.add_button_group(
-            "reset", _NOTHING, hint="Back to the value it had when the recording was opened."
+            "reset", _NOTHING, hint="Restore the value from when the recording was opened."
         )
         self._resets[group] = buttons
 

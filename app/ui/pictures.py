@@ -54,9 +54,9 @@ class PicturesPanel:
         add_button(gui, "Take a picture", shoot, viser.Icon.CAMERA, hint="A PNG of this view.")
         self._way = gui.add_dropdown("fly with", tuple(_WAYS))
         self._seconds = limited(
-            gui.add_number("length (s)", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures a second.")
+            gui.add_number("length (s)", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures per second.")
         )
-        hint = "Numbered PNGs in a zip file, in this size. Keep this tab in front."
+        hint = "Numbered PNGs of this size, in a zip file. Keep this browser tab in front."
         fly = partial(self._reporting, act=self._fly)
         self._start = add_button(gui, "Fly along the path", fly, viser.Icon.MOVIE, hint=hint)
         self._progress = gui.add_progress_bar(0.0, visible=False)
@@ -118,7 +118,7 @@ class PicturesPanel:
             return rendered
         except TimeoutError:
             raise HemislamError(
-                "The browser sent no picture in time; keep its tab in front, or choose a smaller size."
+                "The browser sent no picture in time; keep this tab in front, or choose a smaller size."
             ) from None
         except RuntimeError:
             raise HemislamError("The browser could not render this; choose a smaller size.") from None
@@ -154,7 +154,7 @@ class PicturesPanel:
                     if self._stopped.is_set():
                         return
                     if self._page.snapshot().session != session:
-                        raise HemislamError("The map is another one now, so the flight has ended; start it again.")
+                        raise HemislamError("The map has been replaced, so the flight has ended; start it again.")
                     pictures.writestr(f"{number:05d}.png", self._png(rendered, key, light))
                     self._share = number / len(stations)
             part.replace(file)

@@ -130,7 +130,9 @@ class ReadoutPanel:
     def _add_plots(self, gui: viser.GuiApi) -> None:
         colours = [css(STAGE_COLOURS[stage]) for stage in reversed(STAGES)]
         self._whole = gui.add_checkbox(
-            "all frames", False, hint="In the plots; where frames share a place, the worst is drawn. Off: the last 300."
+            "all frames",
+            False,
+            hint="Plot all frames; where several share a pixel, the worst is drawn. Off: the last 300.",
         )
         gui.add_html(heading("Frame time by stage, ms (peaks cut)"))
         layers = [{"stroke": colour, "width": 0, "fill": colour} for colour in colours]

@@ -118,7 +118,7 @@ class StudyPanel:
         self._curve_changes = Changes(page.now, PANEL_PERIOD_S)
 
         self._by = gui.add_dropdown(
-            "colour scan by", STUDY_BY, initial_value=AS_MAP, hint="Of the newest frame only. V: the next."
+            "colour scan by", STUDY_BY, initial_value=AS_MAP, hint="Colours of the newest frame only. V: next mode."
         )
         self._legend = gui.add_html(study_legend(None, AS_MAP))
         self._alone = gui.add_checkbox("only this frame", False, hint="Hide the map.")
@@ -130,7 +130,7 @@ class StudyPanel:
             gui.add_number("neighbours", 20, min=4, max=200, step=1, hint="Nearest points of this scan.")
         )
         self._point = gui.add_html(panel("quiet", _ASK))
-        gui.add_html(heading("Download this frame with all its points' numbers"))
+        gui.add_html(heading("Download this frame with the values of each point"))
         self._save = gui.add_button_group("save", ("PLY", "PCD"), hint="In the LiDAR frame.")
         self._save.on_click(by_user(self._download))
         add_command(gui, "Next colour mode of the frame under study", lambda _: choose_next(self._by), hotkey="V")

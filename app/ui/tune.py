@@ -28,8 +28,8 @@ _TITLES: Final = {one.title: one.name for one in OBJECTIVES.values()}
 _FORK: Final = "trial "
 """How forks that were opened here are named."""
 _EMPTY: Final = (
-    "Choose what varies and what is wanted, go to a part of the recording that shows the trouble, and press Start. "
-    "Each trial runs that part with other parameters, beside this session."
+    "Choose the parameters to vary and the objective, go to a part of the recording that shows the problem, and press "
+    "Start. Each trial processes that part with other parameters, without changing this session."
 )
 
 
@@ -51,21 +51,23 @@ class TunePanel:
         self._parameters = gui.add_text(
             "what varies",
             "ground.alpha, ground.sigma",
-            hint="Names as in YAML, each over its range or a narrower one: ground.alpha=10:40.",
+            hint="Names as in YAML, each over its full range or a narrower one: ground.alpha=10:40.",
         )
         self._first = gui.add_dropdown("wanted", tuple(_TITLES), initial_value=OBJECTIVES["entropy"].title)
-        self._second = gui.add_dropdown("and", (_NONE, *_TITLES), hint="With two, no trial is best: a front is shown.")
+        self._second = gui.add_dropdown(
+            "and", (_NONE, *_TITLES), hint="With two objectives, the page shows the Pareto front."
+        )
         self._part = gui.add_dropdown(
             "on",
             (*_PARTS, _LABELLED),
             initial_value="20 s from here",
-            hint="The best are then checked on as much behind it.",
+            hint="The best are then checked on the next part of the same length.",
         )
         self._search = gui.add_dropdown("search", get_args(SearchMethod), hint="How the next trials are chosen.")
         self._trials = gui.add_slider("trials", 8, 400, 8, 48)
         self._start = add_button(gui, "Start", lambda _: self._begin(), viser.Icon.PLAYER_PLAY, color=None)
         self._go_on = add_button(
-            gui, "Go on", lambda _: self._run(), viser.Icon.PLAYER_TRACK_NEXT, color=None, visible=False
+            gui, "Continue", lambda _: self._run(), viser.Icon.PLAYER_TRACK_NEXT, color=None, visible=False
         )
         self._work = Background(gui, "tune", "The search", "Finished runs stay.")
         self._bridge = Bridge(gui, "trials", self._clicked)
@@ -106,9 +108,7 @@ class TunePanel:
             return _EMPTY
         done = f"{len(found.trials)} of {wanted.trials + 1} trials"
         if self._work.running:
-            return (
-                f"{done} · {self._left(wanted)}" if self._runs else "The first trial runs with the parameters as given."
-            )
+            return f"{done} · {self._left(wanted)}" if self._runs else "The first trial uses the given parameters."
         if not found.finished:
             failed = bool(found.trials) and all(trial.error for trial in found.trials)
             return f"{done} · stopped" + (f" · all failed: {found.trials[0].error}" if failed else "")
@@ -183,7 +183,7 @@ class TunePanel:
         if (left := snapshot.recording.end_s - begin) < _LEAST_S:
             raise HemislamError(
                 f"Only {max(left, 0.0):.1f} s of the recording are left from here; go back to a part that shows the "
-                "trouble, or choose the whole recording."
+                "problem, or choose the whole recording."
             )
         return begin, length
 

@@ -47,7 +47,7 @@ def test_chips_rows_and_heads_of_the_table_can_be_clicked(bench: Bench) -> None:
     expect(page.locator("tr[aria-selected]")).to_have_count(9)
     page.locator("tr[aria-selected]", has_text="12–89").click()
     expect(page.get_by_text("keyframes 12–89")).to_be_visible()
-    expect(page.get_by_text("Points over their distance")).to_be_visible()
+    expect(page.get_by_text("Histogram of the points' distances")).to_be_visible()
     assert InspectLoop(GOOD) in bench.engine.sent
     page.locator("tr[aria-selected]", has_text="12–89").press("Enter")
     expect(page.get_by_text("keyframes 12–89")).to_have_count(0)

@@ -94,17 +94,17 @@ class AddLoopPanel:
         self._picked: list[int] | None = None
         self._nudging: Nudging | None = None
         self._tried = False  # with keyframes that cannot be
-        gui.add_html(panel("text", "Tell the graph that two keyframes see the same place, whatever the search found."))
+        gui.add_html(panel("text", "Connect two keyframes that see the same place, even if the search found no loop."))
         self._older = limited(gui.add_number("older keyframe", 0, min=0, step=1))
         self._newer = limited(gui.add_number("newer keyframe", 0, min=0, step=1))
         self._pick = add_button(gui, _PICK, lambda _: self._toggle_picking(), viser.Icon.POINTER)
         self._register = gui.add_checkbox(
-            "register", True, hint="Register the submaps on each other. Off: the guess is used as it is."
+            "register", True, hint="Register one submap to the other. Off: use the guess as it is."
         )
         self._nudge = gui.add_checkbox(
             "nudge the guess",
             False,
-            hint="First move the newer submap by arrows and rings. Off: the guess is where the graph has it.",
+            hint="First move the newer submap with arrows and rings. Off: the guess is its pose in the graph.",
         )
         self._try = add_button(gui, "Try it", lambda _: self.suggest(), viser.Icon.LINK, color=None)
         self._problem = gui.add_html("", visible=False)

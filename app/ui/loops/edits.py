@@ -192,11 +192,11 @@ class VerdictPanel:
         self._pair: Pair | None = None
         self._dragged: Edit | None = None
         self._headline = gui.add_html("")
-        hint = "Put it into the graph now, as a loop of its own; Undo takes that back."
+        hint = "Add it to the graph now, as a factor of its own; Undo reverts this."
         self._accept = add_button(
             gui, "Accept it", lambda _: self._decide(Accept), viser.Icon.THUMB_UP, color="teal", hint=hint
         )
-        hint = "Take it out of the graph now; Undo brings it back."
+        hint = "Remove it from the graph now; Undo restores it."
         self._reject = add_button(
             gui, "Reject it", lambda _: self._decide(Reject), viser.Icon.THUMB_DOWN, color="red", hint=hint
         )
@@ -205,7 +205,12 @@ class VerdictPanel:
         self._reason = gui.add_html("")
         self._words = gui.add_html("")
         self._weight = gui.add_slider(
-            "weight", 0.1, 10.0, 0.1, 1.0, hint="Divides its covariance in the graph; 1 is as registered."
+            "weight",
+            0.1,
+            10.0,
+            0.1,
+            1.0,
+            hint="Divides the covariance of the loop in the graph; 1 keeps it as registered.",
         )
         self._weight.on_update(as_set(lambda weight, _: self._drag(weight)))
 
@@ -263,8 +268,8 @@ class EditsPanel:
         load = gui.add_upload_button("Load edits…", icon=viser.Icon.UPLOAD, color="gray", mime_type=".yaml,.yml,text/*")
         load.on_upload(by_user(lambda file, _: self._load(file.content)))
         undo, redo = (lambda _: send(UndoLoop())), (lambda _: send(RedoLoop()))
-        add_command(gui, "Undo the last edit of a loop", undo, hotkey="Z", modifier="cmd/ctrl")
-        add_command(gui, "Redo the edit undone last", redo, hotkey="Z", modifier="cmd/ctrl+shift")
+        add_command(gui, "Undo the last loop edit", undo, hotkey="Z", modifier="cmd/ctrl")
+        add_command(gui, "Redo the last undone loop edit", redo, hotkey="Z", modifier="cmd/ctrl+shift")
 
     def draw(self, snapshot: Snapshot) -> None:
         for button, verb, commands in (

@@ -96,11 +96,11 @@ class Inspector:
         self._alone_before: bool | None = None  # while the map is shown in place of the submaps
         self._evidence = gui.add_html("")
         self._go = gui.add_button_group(
-            "go", (FLY, SEEK, CLOSE), hint="Fly to the loop, seek to the frame at which it was decided, or close it."
+            "go", (FLY, SEEK, CLOSE), hint="Fly to the loop, go to the frame of its verdict, or close it."
         )
         self._go.on_click(by_user(act))
         self._waiting = gui.add_html(panel("quiet", "Waiting for the submaps …"))
-        hint = "Left: where the graph had the submaps. Right: as they were registered."
+        hint = "Left: the submaps as the graph placed them. Right: as registered."
         self._share = gui.add_slider("graph to fit", 0.0, 1.0, 0.01, 1.0, hint=hint)
         self._alone = gui.add_checkbox(
             "hide the map", True, hint="Show the two submaps alone, without the map and the scan."
@@ -111,12 +111,12 @@ class Inspector:
 
     def _add_details(self, gui: viser.GuiApi) -> None:
         self._legend = gui.add_html("")
-        gui.add_html(heading("Heights around both keyframes from above, the newer turned to match; grey: never seen"))
+        gui.add_html(heading("Heights around both keyframes from above, the newer rotated to match; grey: not seen"))
         self._contexts = gui.add_image(_NO_CONTEXTS, format="png")
         self._shifts_title = gui.add_html("")
         line, limit = {"stroke": "#40b8f0", "width": 1.5}, {"stroke": "#e08a00", "width": 1.5, "dash": [3, 3]}
         self._shifts = chart(gui, (np.zeros(1),) * 3, [line, limit])
-        gui.add_html(heading("Points over their distance to the other submap's surface, mm"))
+        gui.add_html(heading("Histogram of the points' distances to the other submap's surface, mm"))
         self._residuals = chart(gui, (np.zeros(1),) * 3, [line | {"fill": "#40b8f080"}, limit])
 
     def show_map(self) -> None:
@@ -158,7 +158,9 @@ class Inspector:
     def _draw_charts(self, detail: LoopDetail, params: LoopsParams) -> None:
         turn = best_yaw(detail.shift_distances)
         self._contexts.image = contexts_image(detail.older_context, detail.newer_context, turn)
-        title = f"Difference of the two over the turn of the newer, in degrees; least at {np.degrees(turn):.0f}°"
+        title = (
+            f"Difference of the two against the rotation of the newer, in degrees; smallest at {np.degrees(turn):.0f}°"
+        )
         self._shifts_title.content = heading(title)
         self._shifts.data = shift_curve(detail.shift_distances, params.context_distance)
         self._residuals.data = outline = histogram(detail.residuals, params.max_residual)

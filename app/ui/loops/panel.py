@@ -29,11 +29,11 @@ _STEP_S: Final = 0.03
 _LEAST_SLOPE: Final = 0.9
 """Least steepness of the view downwards (z over the horizontal), to see into a building."""
 _SOLVE_HINT: Final = (
-    "Levenberg-Marquardt over all factors, instead of one keyframe after the other. You first see what it would change."
+    "Levenberg-Marquardt over all factors, instead of one keyframe after another. First shows what would change."
 )
 _NONE_YET: Final = (
-    "No loops yet. They are searched for where the trajectory comes back to a place that it left at least 15 s before; "
-    "the parameters are under Parameters, Loop search."
+    "No loops yet. They are searched for where the trajectory returns to a place that it left at least 15 s before; "
+    "for the settings, see Parameters, Loop search."
 )
 
 
@@ -86,11 +86,12 @@ class LoopsPanel:
                 hint=_SOLVE_HINT,
             )
             self._solving = gui.add_html(
-                panel("text", "What it would change is shown above, under “Before you decide”."), visible=False
+                panel("text", "The changes that it would make are shown above, under “Before you decide”."),
+                visible=False,
             )
             self._factors = gui.add_html("")
-        add_command(gui, "Next loop of the table", lambda _: self._step(1), hotkey="J")
-        add_command(gui, "Previous loop of the table", lambda _: self._step(-1), hotkey="K")
+        add_command(gui, "Next loop in the table", lambda _: self._step(1), hotkey="J")
+        add_command(gui, "Previous loop in the table", lambda _: self._step(-1), hotkey="K")
 
     def seen(self, view: View) -> View:
         """The view, without the map and the scan while two submaps are shown alone."""

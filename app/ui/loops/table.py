@@ -33,7 +33,7 @@ COLUMNS: Final[dict[str, TableColumn]] = {
         lambda e: SIGNS[e.verdict] + ("✎" if kind_of(e).name == EDITED else ""),
     ),
     "keyframe": TableColumn(
-        "loop", "keyframes", "Numbers of the older and the newer keyframe that it ties together.",
+        "loop", "keyframes", "Numbers of the older and the newer keyframe that the loop connects.",
         lambda e: e.newer + e.older * 1e-7, lambda e: name(e.pair),
     ),
     "context": TableColumn(
@@ -45,7 +45,7 @@ COLUMNS: Final[dict[str, TableColumn]] = {
         lambda e: e.evidence.overlap, lambda e: number(100 * e.evidence.overlap, 0),
     ),
     "residual": TableColumn(
-        "residual", "mm", "Distance of the points to the other submap's planes, RMS in mm.",
+        "residual", "mm", "RMS distance of the points to the other submap's planes, in mm.",
         lambda e: e.evidence.residual_rms, lambda e: number(1000 * e.evidence.residual_rms, 0),
     ),
     "mahalanobis": TableColumn(
@@ -94,7 +94,7 @@ def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
         (edge, first.text(edge), kind_of(edge).colour, [column.text(edge) for column in others], edge.pair == chosen)
         for edge in edges[:MOST_ROWS]
     ]
-    remark = "" if edges else "All are hidden; click a kind above to show it."
+    remark = "" if edges else "All loops are hidden; click a kind above to show it."
     if len(edges) > MOST_ROWS:
         remark = f"The first {MOST_ROWS} of {len(edges):,}; sort by another column or hide a kind to see others."
     return panel("loops.table", heads, rows, source("loop_table.js"), remark)

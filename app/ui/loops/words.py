@@ -41,7 +41,7 @@ KINDS: Final[dict[str, LoopKind]] = {
     kind.name: kind
     for kind in (
         LoopKind("accepted", "The search accepted them; they correct the map.", (62, 207, 154), 3.0, 1.0, 0.1),
-        LoopKind("candidate", "They fit, but wait for other loops that agree.", (255, 190, 60), 2.0, 2.0, 0.1),
+        LoopKind("candidate", "They fit, but wait until other loops agree.", (255, 190, 60), 2.0, 2.0, 0.1),
         LoopKind("rejected", "The search rejected them; they change nothing.", (214, 84, 92), 1.0, 1.0, 0.07),
         LoopKind(
             EDITED,
@@ -160,7 +160,7 @@ def forecast(
     """
     what = describe_edit(command).capitalize()
     if preview is None:
-        working = problem or "The engine computes what it would change …"
+        working = problem or "Computing what would change …"
         return panel("loops.forecast", what, working)
     worst = [_worst(side) for side in (residuals, preview.residuals)]
     change = _cost_change(residuals, preview.residuals) if isinstance(command, Solve) else None

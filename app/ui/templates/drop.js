@@ -55,7 +55,7 @@ if (!window.hemislamDrop) {
     const last = files.at(-1);
     busy = true;
     try {
-      if (!last?.size) throw new Error('That is empty or a folder; put folders where hemislam was started, and open them there.');
+      if (!last?.size) throw new Error('This is empty or a folder; copy folders to where hemislam was started, and open them from there.');
       for (const file of files) await copy(file); // what lies beside a recording comes first
       if (RECORDING.test(last.name))
         await ask('', {method: 'POST', body: JSON.stringify({path: last.name}), headers: {'Content-Type': 'application/json'}});

@@ -1,20 +1,20 @@
-// One minute through the page on the first visit: what is spoken of is outlined, Esc or Skip ends it.
+// A one-minute tour of the page on the first visit. The element described is outlined; Esc or Skip ends the tour.
 if (!window.hemislamTour) {
   const STEPS = [
-    ['.hs-steps', '', 'Play, or step', 'Space plays and pauses; ← and → step one frame. When you go back, the map and your edits are kept.'],
+    ['.hs-steps', '', 'Play, or step', 'Space plays and pauses; ← and → step one frame. Going back keeps the map and your edits.'],
     ['.hs-track', '', 'Go anywhere', 'Drag the track. Its marks show loops, notes and trouble; open Diagnostics to see what the trouble was.'],
-    ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is labelled '
-      + 'again at once. Teal is ground, amber are the seeds its plane is fitted to. Try σ first.', 2],
-    ['', 'Loops', 'Judge a loop', 'Where the walk comes back, a loop straightens the map. Click its green knob or its row to see '
-      + 'what it rests on, then Reject it: the yellow line is the path before, and Undo is in its place.'],
-    ['', 'Help', 'That is all', 'Every number says on hover what it is. This tour and all keys are under Help.'],
+    ['[role=slider][aria-valuenow]:not(input)', 'Parameters', 'Tune the ground', 'Move a slider: the map is dimmed and this scan is '
+      + 'relabelled at once. Ground is teal; the seeds to which the plane is fitted are amber. Try σ first.', 2],
+    ['', 'Loops', 'Judge a loop', 'Where the walk returns to a place, a loop corrects the map. Click its green knob or its row to see '
+      + 'the evidence, then Reject it: the yellow line is the path before, and Undo replaces the button.'],
+    ['', 'Help', 'That is all', 'Hover over a number to see what it means. This tour and all keys are under Help.'],
   ];
   const seen = () => { try { localStorage.setItem('hemislam-tour', 'seen'); } catch { /* private window */ } };
   window.hemislamTour = () => {
     if (document.querySelector('.hs-tour')) return;
     const box = document.createElement('div');
     let at = 0, outlined = null, opened = null;
-    const outline = () => { // again and again: viser may make again what is outlined
+    const outline = () => { // repeatedly, since viser may rebuild the outlined element
       const [target, , , , place = 0] = STEPS[at], found = target ? document.querySelectorAll(target)[place] : opened;
       if (found !== outlined) outlined?.classList.remove('hs-outlined');
       outlined = found;
@@ -22,7 +22,7 @@ if (!window.hemislamTour) {
     };
     const timer = setInterval(outline, 500);
     const playing = () => { const now = JSON.parse(document.querySelector('.hs-state').dataset.state); return now.playing && !now.live; };
-    const held = playing(); // nothing runs on behind what is read
+    const held = playing(); // pause while the user reads
     if (held) window.hemislamTransport('pause');
     const end = () => {
       clearInterval(timer); outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key);
@@ -49,9 +49,9 @@ if (!window.hemislamTour) {
     show();
   };
   const first = () => { try { return !localStorage.getItem('hemislam-tour'); } catch { return false; } };
-  const wait = () => { // until there is something to show
+  const wait = () => { // until a recording is open
     const node = document.querySelector('.hs-state');
-    if (!first() || document.querySelector('.hs-view-only')) return; // nobody is told to try what has no effect
+    if (!first() || document.querySelector('.hs-view-only')) return; // a view-only page cannot try these steps
     if (node && JSON.parse(node.dataset.state).open && document.querySelector('body > * .hs-transport')) window.hemislamTour();
     else setTimeout(wait, 1000);
   };

@@ -133,7 +133,7 @@ canvas.onpointermove = (event) => {
   if (!d) return;
   const box = canvas.getBoundingClientRect(), x = event.clientX - box.left, y = event.clientY - box.top;
   const row = Math.floor((y - HEAD) / ROW), over = x >= NAME && x <= box.width - VALUE;
-  const loops = 'Loops by verdict: ✓ accepted, × rejected, ? waiting for others that agree.';
+  const loops = 'Loops by verdict: ✓ accepted, × rejected, ? waiting until others agree.';
   canvas.title = over || row < 0 ? '' : d.strips[row] ? d.strips[row].hint : loops;
   const place = (frame) => NAME + (frame + 0.5) / d.frames * (box.width - NAME - VALUE);
   const near = d.notes.filter(([frame]) => over && Math.abs(place(frame) - x) < 4);

@@ -174,7 +174,7 @@ if (!window.hemislamSay) {
     const text = box.value.trim().replace('−', '-').replace(',', '.'), value = Number(text);
     const thumb = box.closest('.mantine-Flex-root').querySelector('[role=slider]');
     const [low, high] = thumb ? ['min', 'max'].map((end) => Number(thumb.getAttribute('aria-value' + end))) : [];
-    const bad = !text || !isFinite(value) ? 'A number, please.' : value < low || value > high ? `${low} to ${high}` : '';
+    const bad = !text || !isFinite(value) ? 'Enter a number.' : value < low || value > high ? `${low} to ${high}` : '';
     if (bad && complain) { box.setCustomValidity(bad); box.reportValidity(); return; }
     restore(box);
     if (bad) return;

@@ -135,7 +135,7 @@ def test_nothing_can_be_applied_before_its_effect_is_known(page: Page) -> None:
     page.loops._proposal._send = page.engine.send
     page.loops._proposal.propose(SetWeight(*GOOD, 4.0))
     page.draw()
-    assert page.loops._proposal._apply.disabled and "computes" in page.loops._proposal._words.content
+    assert page.loops._proposal._apply.disabled and "Computing" in page.loops._proposal._words.content
 
 
 def test_the_engine_s_refusal_is_shown_in_the_proposal(page: Page) -> None:

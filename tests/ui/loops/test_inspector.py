@@ -98,7 +98,7 @@ def test_a_loop_that_another_is_in_the_graph_for_says_which(page: Page) -> None:
     edge = next(edge for edge in page.engine.snapshot.loops.edges if edge.counts)
     other = replace(edge, represented_by=(12, 340))
     assert "corrects the map" not in panel("loops.reason", edge, (0, 0, 0))
-    assert "loop 12–340 close by corrects the map for both" in panel("loops.reason", other, (0, 0, 0))
+    assert "the nearby loop 12–340 corrects the map for both" in panel("loops.reason", other, (0, 0, 0))
 
 
 def test_the_legend_names_the_loops_and_the_two_submaps(page: Page) -> None:
