@@ -109,13 +109,13 @@ def info(
 ) -> None:
     """Examine a recording and report what is wrong.
 
-    Topics, rates, time fields, units, gaps, clocks, gravity; each with what hemislam does about it.
+    Checks topics, rates, time fields, units, gaps, clocks and gravity, and says what hemislam does about each.
 
     \b
     Each finding has a verdict:
       fine        nothing to do
       corrected   hemislam corrects it and says how
-      needs you   only you can decide; the option to use is printed below
+      needs you   only you can decide; the option to use is printed below the finding
 
     \b
     Examples:
@@ -162,25 +162,28 @@ def simulate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed gives another trajectory.")] = 0,
     rate: Annotated[int, typer.Option("--rate", metavar="HZ", help="Revolutions per second, 10 or 20.")] = 10,
     every_block: Annotated[
-        int | None, typer.Option("--every-block", metavar="K", help="Fire every K-th azimuth only, for a small file.")
+        int | None,
+        typer.Option("--every-block", metavar="K", help="Fire only at every K-th azimuth, for a small file."),
     ] = None,
     coordinate_step: Annotated[
         float, typer.Option("--coordinate-step", metavar="METRES", help="Round x, y, z for a smaller file; 0: do not.")
     ] = 0.0,
     range_step: Annotated[
         float,
-        typer.Option("--range-step", metavar="METRES", help="Step of distances; 0.0025 for a newer unit, 0: none."),
+        typer.Option("--range-step", metavar="METRES", help="Resolution of ranges; 0.0025 for a newer unit, 0: exact."),
     ] = 0.005,
     scanner: Annotated[
         str, typer.Option("--scanner", metavar="NAME", help="bpearl, airy, jt128 or mid360.")
     ] = "bpearl",
     tables: Annotated[
         Path | None,
-        typer.Option("--tables", metavar="FOLDER", help="Holds the maker's tables of a jt128 or mid360."),
+        typer.Option("--tables", metavar="FOLDER", help="Folder with the manufacturer's tables of a jt128 or mid360."),
     ] = None,
     upright: Annotated[
         bool | None,
-        typer.Option("--upright/--forward", help="The scanner's z looks up or forward; else as usual for it."),
+        typer.Option(
+            "--upright/--forward", help="The scanner's z axis points up or forward; default: as usual for this scanner."
+        ),
     ] = None,
     imperfect: options.Imperfect = False,
     errors: Annotated[
@@ -195,9 +198,9 @@ def simulate(
 ) -> None:
     """Simulate a recording in a modelled scene.
 
-    A person carries an RS-Bpearl (or another scanner) and an IMU through it and stands still for the first seconds.
-    FILE_truth.tum has the true poses, FILE.params.yaml has the pose of the LiDAR on the IMU, both
-    beside FILE.mcap. Each point has its true label in the field `ground`, where the driver's layout has fields.
+    A person carries an RS-Bpearl (or another scanner) and an IMU through the scene and stands still for the first
+    seconds. Beside FILE.mcap, FILE_truth.tum contains the true poses and FILE.params.yaml the pose of the LiDAR on
+    the IMU. Each point has its true label in the field `ground`, if the driver's layout has fields.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""`hemislam calibrate`: the mounting and the clocks, from a recording alone."""
+"""`hemislam calibrate`: mounting, clock offset and scan-line errors, from a recording alone."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ def calibrate(
     force: Annotated[
         bool, typer.Option("--force", help="With --write: also change a NAME.params.yaml that you wrote.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print numbers for programs.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="FILE.svg", help="Draw the residuals before and after.")
     ] = None,
@@ -32,14 +32,15 @@ def calibrate(
 ) -> None:
     """Find the pose of the LiDAR on the IMU, the offset of their clocks and the errors of each scan line.
 
-    The LiDAR is tracked by its scans alone, and its motion is compared with the IMU's. Walk and turn the scanner about
-    all axes; values that the motion does not determine are reported as such. If a mounting is given (--preset,
-    `sensor.rotation`, `sensor.translation`), the mean of both is saved. An earlier calibration does not count as given.
+    The LiDAR is tracked by its scans alone, and its motion is compared with the IMU's. Walk and turn the scanner
+    about all axes; values that the motion does not determine are reported as such. If a mounting is given (--preset,
+    `sensor.rotation`, `sensor.translation`), the weighted mean of both is saved. An earlier calibration does not
+    count as given.
 
     \b
     Examples:
       hemislam calibrate walk.mcap
-      hemislam calibrate walk.mcap --write              `run`, `serve` and `info` use it from then on
+      hemislam calibrate walk.mcap --write              `run`, `serve` and `info` then use the result
       hemislam calibrate walk.mcap --json --plot residuals.svg
     """
     from app.calibration import words
@@ -52,11 +53,12 @@ def calibrate(
     if write and not force:
         words.check_beside(recording)
     if plot is not None and (plot.suffix != ".svg" or plot.is_dir() or not plot.parent.is_dir()):
-        raise HemislamError(f"{plot} cannot be drawn; choose a .svg file in a folder that exists as --plot.")
+        raise HemislamError(f"{plot} cannot be written; choose a .svg file in a folder that exists as --plot.")
     params = params_for(recording, calibrated=False)
     if calibrated_beside(recording):
         typer.echo(
-            f"The earlier calibration in {sidecar(recording)} does not count: the walk is calibrated anew.", err=as_json
+            f"The earlier calibration in {sidecar(recording)} is ignored: the recording is calibrated anew.",
+            err=as_json,
         )
     compile_behind_bar()
     with progress_bar("Calibrating") as show:

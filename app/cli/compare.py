@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def compare(
     map_: Annotated[Path, typer.Argument(metavar="MAP", help="A folder of results, or a .ply, .las or .laz.")],
-    other: Annotated[Path, typer.Argument(metavar="OTHER", help="The same, in the same frame.")],
+    other: Annotated[Path, typer.Argument(metavar="OTHER", help="The other map, in the same frame.")],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.ply", help="Write the points of MAP with their distances.")
     ] = None,
@@ -24,14 +24,14 @@ def compare(
         bool, typer.Option("--fit", help="Move OTHER onto MAP first; they must lie within 2 m and a few degrees.")
     ] = False,
     reach: Annotated[
-        float, typer.Option("--reach", metavar="METRES", min=0.01, max=10.0, help="What is farther is not the same.")
+        float, typer.Option("--reach", metavar="METRES", min=0.01, max=10.0, help="Farther surfaces do not correspond.")
     ] = 0.5,
 ) -> None:
     """Measure how far one map lies from another.
 
-    Distances are along the surface's normal, positive where MAP lies in front
-    of OTHER: towards the sensor for results, upwards for other files. The
-    smallest distance that is no chance is known for each point.
+    Distances are along the surface normal, positive where MAP lies in front
+    of OTHER: towards the sensor for results, upwards for other files. For each
+    point, the smallest significant distance (level of detection) is given too.
 
     \b
     Examples:
@@ -56,7 +56,7 @@ def compare(
 
 
 def _check(out: Path, *maps: Path) -> None:
-    """Refuse, before the work, what cannot be written or would replace what is compared."""
+    """Refuse early an output that cannot be written or would replace one of the maps."""
     if out.suffix.lower() != ".ply" or out.is_dir() or not out.parent.is_dir():
         raise HemislamError(f"{out} cannot be written; choose a .ply file in a folder that exists as --out.")
     try:

@@ -30,7 +30,7 @@ ClusterData = Annotated[
     typer.Option(
         "--cluster-data",
         metavar="URL",
-        help="Where its workers find the recordings, e.g. s3://bucket/walks. Default: the same path, else from here.",
+        help="Where the workers find the recordings, e.g. s3://bucket/walks. Default: the same path, or a copy.",
     ),
 ]
 PartStart = Annotated[
@@ -40,7 +40,7 @@ PartStart = Annotated[
         min=0,
         max=MOST_S,
         metavar="SECONDS",
-        help="Measure from this time after the first scan on; every system starts 5 s earlier.",
+        help="Measure from this time after the first scan; every system starts 5 s earlier.",
     ),
 ]
 Out = Annotated[
@@ -68,29 +68,31 @@ def evaluate(
     truths: Truths = None,
     lever: Annotated[
         str | None,
-        typer.Option("--lever", metavar="X,Y,Z", help="Metres from the IMU to the truth's point, in its body's axes."),
+        typer.Option(
+            "--lever", metavar="X,Y,Z", help="Metres from the IMU to the point of the truth, in the axes of its body."
+        ),
     ] = None,
     variants: Annotated[
         list[str] | None,
-        typer.Option("--variant", metavar="NAME:PARAM=VALUE,...", help="One more column. Repeatable."),
+        typer.Option("--variant", metavar="NAME:PARAM=VALUE,...", help="Add a variant as a column. Repeatable."),
     ] = None,
     baselines: Annotated[
         list[str] | None,
         typer.Option(
             "--baseline",
             metavar="SYSTEM",
-            help="Another system as one more column: loam, liom, kiss-icp, rko-lio or genz-icp. Repeatable.",
+            help="Add another system as a column: loam, liom, kiss-icp, rko-lio or genz-icp. Repeatable.",
         ),
     ] = None,
     ablation: Annotated[
-        bool, typer.Option("--ablation/--no-ablation", help="The paper's four variants, or only your own.")
+        bool, typer.Option("--ablation/--no-ablation", help="With the paper's four variants, or with your own only.")
     ] = True,
     compare: Annotated[
         list[str] | None,
         typer.Option(
             "--compare",
             metavar="NAME=FILE.tum",
-            help="Another system's trajectory as one more column; with several recordings NAME@RECORDING=FILE.",
+            help="Add another system's trajectory as a column; with several recordings: NAME@RECORDING=FILE.",
         ),
     ] = None,
     suite: Suite = None,
@@ -103,15 +105,15 @@ def evaluate(
     start: PartStart = 0.0,
     duration: Duration = None,
 ) -> None:
-    """Measure accuracy, time and map sharpness: the paper's ablation, and yours.
+    """Measure accuracy, time and map sharpness: the paper's ablation and your own.
 
-    Each recording is run with FAST-LIO (no ground downsampling, no loops), FAST-LIO-GD, FAST-LIO-L
+    Each recording is processed with FAST-LIO (no ground downsampling, no loops), FAST-LIO-GD, FAST-LIO-L
     and Ours, and with each --variant and --baseline. Finished runs are reused, so an interrupted evaluation
-    continues where it was.
+    continues where it stopped.
 
     \b
     Writes into DIR:
-      report.html      tables, trajectories, errors, times and pieces of the maps, in one file
+      report.html      tables, trajectories, errors, times and extracts of the maps, in one file
       report.md, *.csv the same tables; tables.tex for LaTeX
       results.json     everything, with parameters, input hashes and the machine
       runs/            trajectory and times of every run
@@ -169,7 +171,7 @@ def evaluate(
 
 
 def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False) -> "RunJobs":
-    """What runs jobs, on this machine or on a cluster.
+    """A function that runs jobs, on this machine or on a cluster.
 
     Raises:
         HemislamError: Dask is not installed, or an option is there without the one it belongs to.

@@ -1,4 +1,4 @@
-"""`hemislam export`: the map and the trajectory in the formats of other programs."""
+"""`hemislam export`: the map and the trajectory in formats for other programs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,10 +20,11 @@ def export(
         Path, typer.Argument(metavar="RESULTS|SESSION", help="A folder of results, or a session file (.hemislam).")
     ],
     formats: Annotated[
-        str, typer.Option("--format", metavar="NAME,...", help="One or several of the names below, with commas.")
+        str, typer.Option("--format", metavar="NAME,...", help="One or more of the names below, separated by commas.")
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else RESULTS/export, or runs/NAME-1.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Where to write; default: RESULTS/export, or runs/NAME-1."),
     ] = None,
     thin: Annotated[
         float, typer.Option("--thin", metavar="METRES", help="Only the first point in each voxel of this size.")
@@ -33,22 +34,22 @@ def export(
         typer.Option(
             "--box",
             metavar="xmin,ymin,zmin,xmax,ymax,zmax[,TURN]",
-            help="Only points inside, m; TURN turns the box about its middle, degrees anticlockwise.",
+            help="Only points inside, m; TURN rotates the box about its centre, degrees anticlockwise.",
         ),
     ] = None,
     slab: Annotated[
-        float, typer.Option("--slab", metavar="METRES", help="Width of the slab along the walk that a profile shows.")
+        float, typer.Option("--slab", metavar="METRES", help="Width of the slab along the path that a profile shows.")
     ] = 1.0,
     moving: Annotated[
         bool,
-        typer.Option("--moving/--no-moving", help="Points on what moves, marked in las, laz, ply and pcd; or none."),
+        typer.Option("--moving/--no-moving", help="With moving points, marked in las, laz, ply and pcd, or without."),
     ] = True,
 ) -> None:
-    """Write a map in the formats of other programs.
+    """Write a map in formats for other programs.
 
-    A session is repeated first. Coordinates are those of the map or, if the results hold a
-    georeference.json, of its coordinate system where the format has one. Points on what moves are
-    marked in las, laz, ply and pcd; the other formats leave them out.
+    A session is replayed first. Coordinates are those of the map. If the results contain a
+    georeference.json, formats that support a coordinate system use that of the file. Moving points
+    are marked in las, laz, ply and pcd; the other formats omit them.
 
     \b
     Formats:
@@ -66,7 +67,7 @@ def export(
       dxf         floor.dxf                the same as outlines
       terrain     terrain.tif              height of the ground as GeoTIFF
       density     density.tif              points per square metre as GeoTIFF
-      section     section.png, .svg, .dxf  the --box from its front
+      section     section.png, .svg, .dxf  the --box seen from its front
       profile     profile.png, .svg, .dxf  the same along the walked path: chainage, height
       kmz         map.kmz                  walk, picture and keyframes for Google Earth
       html        share.html               the map in one page that needs no server
@@ -84,7 +85,7 @@ def export(
 
     exports = of_formats([name.strip() for name in formats.split(",") if name.strip()])
     if not exports:
-        raise HemislamError("--format names no format; give one or several of the names that --help lists.")
+        raise HemislamError("--format names no format; give one or more of the names that --help lists.")
     choice = Choice(thin, _box(box), slab, moving)
     if source.is_dir():
         results, folder = read_results(source), out or source / "export"

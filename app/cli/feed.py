@@ -1,4 +1,4 @@
-"""`hemislam feed`: a recording sent as if by its sensors."""
+"""`hemislam feed`: sends a recording as if it came from the sensors."""
 
 import math
 from typing import Annotated
@@ -18,24 +18,24 @@ def feed(
         typer.Option(
             "--to",
             metavar="URL",
-            help="rsbpearl://HOST:MSOP,DIFOP, airy://HOST, mid360://HOST, or foxglove://HOST:PORT to serve at.",
+            help="rsbpearl://HOST:MSOP,DIFOP, airy://HOST, mid360://HOST, or foxglove://HOST:PORT to act as a server.",
         ),
     ],
     imu_to: Annotated[
         str | None,
         typer.Option(
-            "--imu-to", metavar="URL", help="imu-udp://HOST:PORT, beside an RS-Bpearl; else port 6700 of its HOST."
+            "--imu-to", metavar="URL", help="imu-udp://HOST:PORT, for an RS-Bpearl; default: port 6700 of its HOST."
         ),
     ] = None,
     speed: Annotated[
-        float, typer.Option("--speed", metavar="X", help="Times real time; 0: as fast as possible.")
+        float, typer.Option("--speed", metavar="X", help="Multiple of real time; 0: as fast as possible.")
     ] = 1.0,
     duration: Duration = None,
 ) -> None:
     """Send a recording as live data, to try `serve --live` without a sensor.
 
-    As packets of an RS-Bpearl with the IMU beside them, of an Airy or a Mid-360, or as a Foxglove server like
-    foxglove_bridge.
+    Sends packets of an RS-Bpearl and a separate IMU, of an Airy or of a Mid-360, or acts as a Foxglove server
+    like foxglove_bridge.
 
     \b
     Examples:

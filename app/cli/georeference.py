@@ -17,31 +17,31 @@ def georeference(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="A folder that `run` or the workbench wrote.")],
     gnss: Annotated[
         Path | None,
-        typer.Option("--gnss", metavar="FILE", help="NMEA log or CSV of fixes; else those in the recording."),
+        typer.Option("--gnss", metavar="FILE", help="NMEA log or CSV of fixes; default: the fixes in the recording."),
     ] = None,
     control: Annotated[
         Path | None,
         typer.Option("--control", metavar="FILE", help="CSV of control points: name,E,N,H or name,lat,lon,height."),
     ] = None,
     picks: Annotated[
-        Path | None, typer.Option("--picks", metavar="FILE", help="CSV of where they are in the map: name,x,y,z.")
+        Path | None, typer.Option("--picks", metavar="FILE", help="CSV of their positions in the map: name,x,y,z.")
     ] = None,
     crs: Annotated[
         str,
-        typer.Option("--crs", metavar="EPSG:CODE", help="A plane grid in metres; default: the UTM zone of the place."),
+        typer.Option("--crs", metavar="EPSG:CODE", help="A plane grid in metres; default: the local UTM zone."),
     ] = "",
     lever_arm: Annotated[
         tuple[float, float, float] | None,
         typer.Option("--lever-arm", metavar="X Y Z", help="Metres from the IMU to the antenna, in the IMU's axes."),
     ] = None,
     factors: Annotated[
-        bool, typer.Option("--factors", help="Let the fixes bend the map: write another one to --out.")
+        bool, typer.Option("--factors", help="Let the fixes bend the map; write the bent map to --out.")
     ] = False,
     accept: Annotated[
         list[int] | None, typer.Option("--accept", metavar="FIX", help="Keep this fix. Repeatable.")
     ] = None,
     reject: Annotated[
-        list[int] | None, typer.Option("--reject", metavar="FIX", help="Leave it out. Repeatable.")
+        list[int] | None, typer.Option("--reject", metavar="FIX", help="Reject this fix. Repeatable.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder for the bent map, with --factors.")
@@ -52,15 +52,15 @@ def georeference(
         typer.Option(
             "--height",
             metavar="TEXT",
-            help="What the heights in the file are above: `ellipsoidal`, EPSG:CODE of a system of heights, or other"
+            help="Reference of the heights in the file: `ellipsoidal`, EPSG:CODE of a height system, or other"
             " words; written into the results.",
         ),
     ] = "",
 ) -> None:
-    """Georeference a map by satellite fixes or control points.
+    """Georeference a map with satellite fixes or control points.
 
-    Fixes rotate and shift the map and correct its tilt; with --factors they bend it, too. The offset of the
-    receiver's clock is estimated by comparing the motion, and so is the lever arm if it is not given and the motion
+    Fixes rotate and shift the map and correct its tilt; with --factors they also bend it. The offset of the
+    receiver's clock is estimated by comparing the motion. So is the lever arm, if it is not given and the motion
     determines it. Fixes that contradict the others are rejected and listed.
 
     \b
@@ -126,7 +126,7 @@ def georeference(
 def _bent(
     results: Path, out: Path, fixes: "Fixes", found: "Alignment", overridden: dict[str, bool], *, replace: bool
 ) -> "tuple[Alignment, Trajectory]":
-    """Write trajectory and map, bent by the fixes, to `out`, and remove what another run has left there."""
+    """Write trajectory and map, bent by the fixes, to `out`, and remove the files of an earlier run there."""
     from app.export.exports import BY_RUN, save_results
     from app.export.folder import read_results
     from app.mapping.earth import bent

@@ -1,4 +1,4 @@
-"""What several commands share: options, what becomes of them, a progress bar, and suites of simulated recordings."""
+"""Shared by several commands: options and their evaluation, a progress bar, and suites of simulated recordings."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -30,11 +30,15 @@ Assignments = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="One parameter, e.g. ground.alpha=30. Repeatable."),
 ]
 LidarTopic = Annotated[
-    str | None, typer.Option("--lidar-topic", metavar="TOPIC", help="Point clouds; else the first of type PointCloud2.")
+    str | None,
+    typer.Option("--lidar-topic", metavar="TOPIC", help="Point clouds; default: the topic with times and rings."),
 ]
-ImuTopic = Annotated[str | None, typer.Option("--imu-topic", metavar="TOPIC", help="IMU; else the first of type Imu.")]
+ImuTopic = Annotated[
+    str | None,
+    typer.Option("--imu-topic", metavar="TOPIC", help="IMU; default: the topic with accelerations and rates."),
+]
 MOST_S = 1e9
-"""Of a start or a duration; nanoseconds of far more do not fit into 64 bits."""
+"""Limit of a start or a duration, s; far more nanoseconds do not fit into 64 bits."""
 Start = Annotated[
     float, typer.Option("--start", min=0, max=MOST_S, metavar="SECONDS", help="Begin this long after the first scan.")
 ]
@@ -43,16 +47,18 @@ Duration = Annotated[
     typer.Option("--duration", min=0, max=MOST_S, metavar="SECONDS", help="Process only this much of the recording."),
 ]
 RunFolder = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Where to write; else runs/NAME-1, -2, ...")
+    Path | None, typer.Option("--out", metavar="DIR", help="Where to write; default: runs/NAME-1, -2, ...")
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that DIR already holds.")]
 Imperfect = Annotated[
-    bool, typer.Option("--imperfect", help="With the errors of a real scanner, a lively hand, and people nearby.")
+    bool, typer.Option("--imperfect", help="Simulate the errors of a real scanner, lively motion, and people nearby.")
 ]
 Suite = Annotated[
     str | None,
     typer.Option(
-        "--suite", metavar="NAME", help="`paper`: twins of its six sequences; `revisits`: six walks that come back."
+        "--suite",
+        metavar="NAME",
+        help="`paper`: twins of the paper's six sequences; `revisits`: six walks that return to places.",
     ),
 ]
 Short = Annotated[bool, typer.Option("--short", help="Only the first 60 s of each sequence of the suite.")]
@@ -69,7 +75,7 @@ TruthFile = Annotated[
         "--truth",
         metavar="FILE.tum",
         help="True poses of the IMU, `stamp x y z qx qy qz qw`, to measure the error against;"
-        " else RECORDING_truth.tum beside the recording, if there.",
+        " default: RECORDING_truth.tum beside the recording, if it exists.",
     ),
 ]
 
@@ -84,7 +90,7 @@ def resolve(
     *,
     calibrated: bool = True,
 ) -> "Params":
-    """Parameters from all options together; the topics' own options win over `--set`.
+    """Parameters from all options together; the options for topics override `--set`.
 
     Args:
         calibrated: whether a calibration beside the recording counts.
@@ -100,7 +106,7 @@ def resolve(
 
 
 def say_calibrated(recording: Path) -> None:
-    """Say that a calibration beside the recording is in force, if there is one."""
+    """Say that a calibration beside the recording is used, if there is one."""
     from app.sensors.presets import calibrated_beside
 
     if sentence := calibrated_beside(recording):

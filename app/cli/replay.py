@@ -1,4 +1,4 @@
-"""`hemislam replay`: a session of the workbench once more, without a browser."""
+"""`hemislam replay`: repeats a session of the workbench, without a browser."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,14 +21,14 @@ def replay(
     out: RunFolder = None,
     force: Force = False,
     to_end: Annotated[
-        bool, typer.Option("--to-end", help="Go on to the end of the recording with the last parameters.")
+        bool, typer.Option("--to-end", help="Continue to the end of the recording with the last parameters.")
     ] = False,
 ) -> None:
     """Repeat a session of the workbench to the same result.
 
-    The workbench keeps a session file in runs/sessions/ while a session goes on, and saves one beside
-    the results. It holds what was opened, the parameters by the frame from which they were in force,
-    and the edits of loops. Writes the same files as `hemislam run`.
+    The workbench writes a session file to runs/sessions/ while you work, and saves one beside the results.
+    It contains the recording's path, the parameters with the frame from which they applied, and the loop
+    edits. Writes the same files as `hemislam run`.
 
     \b
     Examples:
@@ -58,7 +58,7 @@ def repeat(path: Path, *, to_end: bool = False) -> "Iterator[tuple[Session, Base
     if saved.left_out:
         typer.echo(f"hemislam: {saved.left_out}", err=True)
     opened, truth = saved.opened, saved.state.truth
-    if truth is not None and not truth.exists():  # no result but its errors follows from it
+    if truth is not None and not truth.exists():  # only the errors against it are lost
         typer.echo(f"The session was compared with {truth}, which no longer exists.")
         truth = None
     part = opened.start_s, opened.duration_s

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from app.slam.params import Params
 
 UNASKED_S = 60.0
-"""How much of a recording is calibrated without being asked."""
+"""s: length of the part of a recording that is used for an automatic calibration."""
 
 
 @with_params
@@ -42,7 +42,7 @@ def run(
     duration: Duration = None,
     truth: TruthFile = None,
     loops: Annotated[
-        Path | None, typer.Option("--loops", metavar="FILE", help="Edits of loops, as the workbench saves them.")
+        Path | None, typer.Option("--loops", metavar="FILE", help="Loop edits, as the workbench saves them.")
     ] = None,
     calibrate: Calibrate = True,
 ) -> None:
@@ -50,13 +50,13 @@ def run(
 
     \b
     Writes into DIR:
-      trajectory.tum           pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw
+      trajectory.tum           pose of the IMU in the map at the end of each scan: stamp x y z qx qy qz qw
       trajectory_odometry.tum  the same by odometry alone, without loops
       loops.csv                every loop candidate: verdict, measurements and reason
       graph.g2o                the pose graph of the keyframes
-      timings.csv              milliseconds of each stage in each frame, without reading the file
+      timings.csv              milliseconds of each stage in each frame, except reading the recording
       map.ply                  the map: x y z intensity ground moving ring time; keyframes
-      report.json              parameters, counts of frames, ground share, errors against truth
+      report.json              parameters, frame counts, ground share, errors against the truth
 
     \b
     Examples:
@@ -75,7 +75,7 @@ def run(
 
     params = params_for(recording)
     say_calibrated(recording)
-    edits = edit_files.read(read_text(loops, "save edits of loops in the workbench"), str(loops)) if loops else ()
+    edits = edit_files.read(read_text(loops, "save loop edits in the workbench"), str(loops)) if loops else ()
     folder = out or free_folder(recording)
     truth_path = truth or truth_beside(recording)
     if truth_path:
@@ -110,7 +110,7 @@ def run(
 
 
 def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
-    """The parameters, with the mounting found in the recording if none is given; and that, in a sentence."""
+    """The parameters, with the mounting found in the recording if none is given, and a sentence that says so."""
     from app.calibration.calibrate import is_mounting_unknown
 
     if not is_mounting_unknown(params):
@@ -123,13 +123,13 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
 
 
 def look_for_mounting(recording: Path, params: "Params") -> str:
-    """What the recording shows about its mounting if the parameters differ, in a sentence; "" if nothing."""
+    """A sentence if the recording shows another mounting than the parameters; otherwise ""."""
     found = _contradicted(recording, params, "Looking for the cause")
     return found if isinstance(found, str) else f"{found.contradiction()}: {_saving(recording)}"
 
 
 def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration | str":
-    """The calibration, if mounting or clock differ from the parameters; else why there can be none, "" if unknown."""
+    """The calibration, if mounting or clock differ from the parameters; else why there is none, "" if unknown."""
     from app.calibration.calibrate import MirroredError, calibrate
 
     with progress_bar(why) as show:
@@ -149,7 +149,7 @@ def _saving(recording: Path) -> str:
 @contextlib.contextmanager
 def _despite_one_interrupt() -> Iterator[None]:
     def warn(*_: object) -> None:
-        typer.echo("hemislam: saving the results; Ctrl-C again gives them up.", err=True)
+        typer.echo("hemislam: saving the results; press Ctrl-C again to discard them.", err=True)
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     before = signal.signal(signal.SIGINT, warn)
@@ -161,7 +161,7 @@ def _despite_one_interrupt() -> Iterator[None]:
 
 @_despite_one_interrupt()
 def save(session: "Session", folder: Path, stop: BaseException | None, *, replace: bool) -> None:
-    """Write the results and sum them up. Ctrl-C pressed once does not stop this.
+    """Write the results and print a summary. A first Ctrl-C does not stop this.
 
     Raises:
         BaseException: `stop`, what ended the run early, once the frames so far are saved.
@@ -181,7 +181,7 @@ def save(session: "Session", folder: Path, stop: BaseException | None, *, replac
     if not report["map"]["points"] and report["map"]["keyframes"]:
         raise HemislamError(
             f"The map has no points: no return lies between sensor.min_range and sensor.max_range; run `hemislam info` "
-            f"on the recording. What there is was saved in {folder}."
+            f"on the recording. The other results were saved in {folder}."
         )
     if isinstance(stop, HemislamError):
         raise HemislamError(f"{stop} The frames before that were processed and saved in {folder}.")
@@ -198,7 +198,7 @@ def free_folder(recording: Path) -> Path:
 
 
 def compile_behind_bar() -> None:
-    """Compile the kernels behind a progress bar; a moment only, once they are in the cache."""
+    """Compile the kernels behind a progress bar; short once they are in the cache."""
     from app.slam.warmup import compile_kernels
 
     with progress_bar("Compiling, first start only") as show:
@@ -206,7 +206,7 @@ def compile_behind_bar() -> None:
 
 
 def process(session: "Session", *, until: int | None = None) -> BaseException | None:
-    """Run to the end of the recording. What stopped it before, an interruption say, is returned, not raised.
+    """Run to the end of the recording. An exception that stops it early, such as an interruption, is returned.
 
     Args:
         until: the last frame to process.
@@ -226,5 +226,5 @@ def process(session: "Session", *, until: int | None = None) -> BaseException | 
 
 def _nothing_processed(session: "Session") -> str:
     reasons = "; ".join(f"{count} x {reason}" for reason, count in session.log.dropped.most_common(3))
-    why = f"all were dropped: {reasons}" if reasons else "there is none in the part asked for"
+    why = f"all were dropped: {reasons}" if reasons else "there is none in the chosen part"
     return f"No scan of {session.feed.info.path} could be processed ({why}); `hemislam info` shows more."

@@ -21,7 +21,7 @@ def serve(
         ),
     ] = None,
     host: Annotated[
-        str, typer.Option("--host", metavar="ADDRESS", help="0.0.0.0 lets other computers in, by a link with a token.")
+        str, typer.Option("--host", metavar="ADDRESS", help="0.0.0.0 admits other computers, by a link with a token.")
     ] = ("127.0.0.1"),
     port: Annotated[int, typer.Option("--port", min=0, max=65535, metavar="PORT", help="0 picks a free one.")] = 8080,
     folder: Annotated[
@@ -29,7 +29,7 @@ def serve(
         typer.Option(
             "--folder",
             metavar="DIR",
-            help="The page may open recordings below DIR. Repeatable. Default: that of RECORDING, or the current one.",
+            help="The page may open recordings below DIR. Repeatable. Default: RECORDING's folder, or the current one.",
         ),
     ] = None,
     point_budget: Annotated[
@@ -38,7 +38,7 @@ def serve(
             "--point-budget",
             min=10_000,
             metavar="N",
-            help="Most map points that the page draws; of a larger map, more of what is near the camera.",
+            help="Most map points that the page draws; in a larger map, more of those near the camera.",
         ),
     ] = 3_000_000,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only.")] = False,
@@ -71,7 +71,7 @@ def serve(
         Path | None, typer.Option("--certificate", metavar="PEM", help="Serve https with this certificate.")
     ] = None,
     key: Annotated[
-        Path | None, typer.Option("--key", metavar="PEM", help="The certificate's key, if it is in a file of its own.")
+        Path | None, typer.Option("--key", metavar="PEM", help="The certificate's key, if it is in a separate file.")
     ] = None,
     log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr, one JSON object per line.")] = False,
     start: Start = 0.0,
@@ -82,7 +82,7 @@ def serve(
     """Open the workbench in the browser.
 
     Replays a recording and shows the map as it grows. Every parameter can be changed while it runs.
-    In the page, space plays and pauses, and the arrow keys step one frame. Ctrl-C ends it.
+    In the page, space plays and pauses, and the arrow keys step one frame. Ctrl-C ends hemislam.
 
     \b
     Examples:
@@ -92,13 +92,13 @@ def serve(
       hemislam serve --folder ~/recordings --port 8081
       hemislam serve --live rsbpearl://0.0.0.0:6699,7788 --imu imu-udp://:6700 --record walk.mcap
       hemislam serve --live foxglove://robot:8765 --preset rslidar
-      hemislam serve walk.mcap --host 0.0.0.0            from other computers, by the printed link
+      hemislam serve walk.mcap --host 0.0.0.0            open to other computers, by the printed link
     """
     from app.child import fork_context
     from app.logs import start_logging
 
     start_logging(json_lines=log_json)
-    fork_context("app.server.engine_process")  # imported there while this process imports the rest
+    fork_context("app.server.engine_process")  # the fork server imports it while this process imports the rest
     from app.evaluation.truth import check_poses
     from app.mapping.session_file import SUFFIX, read_session
     from app.sensors.live.process import LiveProcess
@@ -117,7 +117,7 @@ def serve(
     if live is not None and recording is not None:
         raise HemislamError("Give a recording or --live, not both.")
     if live is None and (imu or record):
-        raise HemislamError("--imu and --record need --live, which says where scans come from.")
+        raise HemislamError("--imu and --record need --live, which names the source of the scans.")
     if live is not None and (paused or start or duration is not None or truth is not None):
         raise HemislamError(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
@@ -133,7 +133,7 @@ def serve(
         truth = truth_beside(recording)
 
     def build_page(viser: Any, forks: Any, folders: Folders) -> ServedPage:
-        """While the engine opens the recording too. A mistake in it is reported here, not in the page."""
+        """Runs while the engine opens the recording. A fault of the recording is reported here, not in the page."""
         if recording is not None:
             open_recording(opened, params).close()
         from app.ui.workbench import Workbench

@@ -21,7 +21,7 @@ def tune(
         typer.Option(
             "--parameters",
             metavar="NAME,NAME=LEAST:GREATEST,...",
-            help="What varies: names of parameters, each over its whole range or a narrower one.",
+            help="Parameters to vary, each over its full range or a narrower one.",
         ),
     ] = "ground.alpha,ground.sigma",
     objectives: Annotated[
@@ -29,7 +29,7 @@ def tune(
         typer.Option(
             "--objective",
             metavar="NAME",
-            help="What is wanted: ate, rpe, loop-drift, ground-f1, entropy, thickness or frame-time. Repeatable."
+            help="Objective: ate, rpe, loop-drift, ground-f1, entropy, thickness or frame-time. Repeatable."
             " Default: ate with a truth, else entropy.",
         ),
     ] = None,
@@ -47,7 +47,7 @@ def tune(
             help="Length of the part after --duration on which the best setting is checked. Default: as long; 0: none.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the search.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the search.")] = 0,
     truths: Truths = None,
     labels: Annotated[
         Path | None,
@@ -66,10 +66,10 @@ def tune(
 ) -> None:
     """Find the parameters that fit a sensor and a place.
 
-    Tries settings on the recordings, the parameters as given first, and then compares the best of them with these on a
-    part that the search has not seen. With several objectives, the settings that no other one beats in all of them are
-    reported. Started again with the same options, an interrupted search goes on where it was; runs that `evaluate` has
-    finished in a folder beside DIR are not run again.
+    Tries settings on the recordings, the given parameters first. Then compares the best settings with the given ones on
+    a part that the search has not seen. With several objectives, reports the Pareto front. An interrupted search
+    continues if it is started again with the same options; runs that `evaluate` has finished in a folder next to DIR
+    are reused.
 
     \b
     Writes into DIR:

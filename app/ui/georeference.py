@@ -236,6 +236,6 @@ def _result(current: Snapshot) -> str:
         what = "control points" if earth.survey.control else "fixes"
         lines, rows = in_rows(found, what), rows_of(found, current)
         if len(found.names) > len(rows):
-            remark = f"{len(rows)} of {len(found.names):,}; those left out and the largest residuals come first."
+            remark = f"{len(rows)} of {len(found.names):,}; the rejected ones and the largest residuals come first."
     picked = [pick.name for pick in earth.survey.picks] if earth.survey.control else []
     return panel("georeference.result", earth.problem, lines, rows, remark, picked, undo)

@@ -153,7 +153,7 @@ class MeasurePanel:
             asked = "The map is hidden; show it to click on points."
         self._asked.content, self._asked.visible = panel("text", asked), bool(asked)
         rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]
-        waiting = f"{later} more on keyframes that the map does not hold now." if later else ""
+        waiting = f"{later} more on keyframes that are not in the map now." if later else ""
         self._list.content = self._bridge.live(panel("measures", rows, waiting)) if rows or later else ""
         self._list.visible, self._save.visible = bool(rows or later), bool(rows)
 

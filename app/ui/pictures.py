@@ -165,7 +165,7 @@ class PicturesPanel:
     def _send(self, client: viser.ClientHandle) -> None:
         size = self._saved.stat().st_size
         if size > _MOST_SENT:
-            raise HemislamError(f"{size_text(size)} are too much for a download; the file is {self._saved}.")
+            raise HemislamError(f"{size_text(size)} is too large to download; the file is {self._saved}.")
         client.send_file_download(self._saved.name, self._saved.read_bytes(), save_immediately=True)
 
     def _reporting(self, client: viser.ClientHandle, act: Callable[[viser.ClientHandle], None]) -> None:

@@ -134,7 +134,7 @@ def where(snapshot: Snapshot) -> str:
         number(transport.frames_per_second, 1) if transport.playing else "",
     )
     if snapshot.live is not None:
-        back = "start with --record" if snapshot.live.recorded is None else "open what is recorded, once it has ended"
+        back = "start with --record" if snapshot.live.recorded is None else "open the recording once it has ended"
         forward = f"A live session only goes forward. To go back, {back}."
         if transport.frame < 0:
             return panel("quiet", f"Waiting for the first scan. {forward}")

@@ -49,11 +49,11 @@ class TunePanel:
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._why = gui.add_html("")
         self._parameters = gui.add_text(
-            "what varies",
+            "parameters",
             "ground.alpha, ground.sigma",
             hint="Names as in YAML, each over its full range or a narrower one: ground.alpha=10:40.",
         )
-        self._first = gui.add_dropdown("wanted", tuple(_TITLES), initial_value=OBJECTIVES["entropy"].title)
+        self._first = gui.add_dropdown("objective", tuple(_TITLES), initial_value=OBJECTIVES["entropy"].title)
         self._second = gui.add_dropdown(
             "and", (_NONE, *_TITLES), hint="With two objectives, the page shows the Pareto front."
         )
