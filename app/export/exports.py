@@ -109,7 +109,7 @@ def _write_report(path: Path, results: Results) -> None:
 EXPORTS = (
     Export(
         "trajectory.tum",
-        "pose of the IMU in the map at each scan's end: stamp x y z qx qy qz qw",
+        "pose of the IMU in the map at the end of each scan: stamp x y z qx qy qz qw",
         lambda path, results: write_tum(path, results.trajectory),
         format="tum",
     ),
@@ -123,13 +123,13 @@ EXPORTS = (
     Export("graph.g2o", "the pose graph of the keyframes", _write_graph, format="g2o", of_loops=True),
     Export(
         "timings.csv",
-        "milliseconds of each stage in each frame, without reading the file",
+        "milliseconds of each stage in each frame, except reading the recording",
         lambda path, results: path.write_text(
             timings_csv(results.log.stamps_ns, results.log.timings_ms), encoding="utf-8"
         ),
     ),
     Export("map.ply", "the map: x y z intensity ground moving ring time; keyframes", _write_map, format="ply"),
-    Export("report.json", "parameters, counts of frames, ground share, errors against truth", _write_report),
+    Export("report.json", "parameters, frame counts, ground share, errors against the truth", _write_report),
     _wanted("las", "map.las", "the map as LAS 1.4: time, intensity, ring, ground, moving", "las.write_las"),
     _wanted("laz", "map.laz", "the same, compressed", "las.write_laz"),
     _wanted("e57", "map.e57", "the map as E57: one scan with its pose per keyframe", "e57.write", "e57"),
