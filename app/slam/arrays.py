@@ -1,4 +1,4 @@
-"""Names of the array types that the values of this package hold, and of three numbers."""
+"""The array types that this package uses, and a vector of three numbers."""
 
 import numpy as np
 import numpy.typing as npt
@@ -12,4 +12,4 @@ U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 Mask = npt.NDArray[np.bool_]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-"""Where pydantic reads one, it refuses nan and infinity."""
+"""pydantic refuses nan and infinity in it."""

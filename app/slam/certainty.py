@@ -1,12 +1,12 @@
-"""How certain a pose is since the walk began, counting errors that repeat from frame to frame.
+"""How certain a pose is relative to the start of the walk, including errors that repeat from frame to frame.
 
 The filter takes the map and the mounting of the LiDAR as exact, so its covariance shows how well a scan fits the map,
 and stays at millimetres however long the walk is. Three errors are left out, and none averages out:
 
 - The map lies where the filter put it. Each new view is mapped with an error of its own, as large as the filter's at
-  that time. These errors add up to a random walk, and its rotations move all that follows.
+  that time. These errors add up to a random walk, and its rotations displace everything mapped later.
 - The tilt caused by a wrong mounting changes direction as the device turns, and so do the errors of the IMU's poses.
-- While the mounting is learnt, the IMU's poses become right; the first one, which defines odom, stays wrong.
+- While the mounting is learnt, the IMU's later poses become right, but the first pose, which defines odom, stays wrong.
 """
 
 from dataclasses import dataclass, replace
@@ -29,10 +29,11 @@ WRONG_SPEED = 0.5
 class Doubt:
     """How far odometry may be off since the last keyframe, because its speed went wrong while scans showed little.
 
-    A scan that contradicts the prediction reveals that. Where scans held all directions before, only this scan is odd.
+    A scan that contradicts the prediction reveals a wrong speed. If earlier scans constrained all directions, this
+    scan is the outlier and there is no doubt about odometry.
 
     Attributes:
-        open_s: s, for how long scans left a direction open. It fades as fast as it grew.
+        open_s: s, for how long scans left a direction open. It falls as fast as it grew.
         metres: standard deviation, along each axis.
     """
 
@@ -40,7 +41,7 @@ class Doubt:
     metres: float = 0.0
 
     def after(self, registration: Registration, seconds: float) -> "Doubt":
-        """After one more scan, which came so long after the last one."""
+        """The doubt after one more scan, `seconds` after the last one."""
         open_s = max(0.0, self.open_s + (seconds if registration.degenerate else -seconds))
         if registration.surprise > iekf.SURPRISING:  # the speed has been found again
             return Doubt(0.0, self.metres + WRONG_SPEED * open_s)
@@ -51,8 +52,8 @@ class Doubt:
 class Certainty:
     """Attributes:
     refined: whether the filter refines the mounting: the errors of its poses then include those of the mounting.
-    first: (6, 6) change of the first pose by the mounting's error. mounting: (6, 6) covariance of that error then.
-    here: (3,) m, p_odom_imu up to which drift was added.
+    first: (6, 6) change of the first pose per error of the mounting. mounting: (6, 6) covariance of that error then.
+    here: (3,) m, p_odom_imu at which drift was last added.
     drift: (6, 6) covariance of the map's error there, rotation then translation, odom axes.
     """
 
@@ -68,7 +69,7 @@ class Certainty:
         return cls(refined, _by_mounting(state), mounting, state.p_odom_imu, np.zeros((6, 6)))
 
     def moved(self, belief: Belief) -> "Certainty":
-        """With the drift of the way from `here` to the belief's position. At rest there is none."""
+        """This with the drift added that accrues from `here` to the belief's position. At rest there is none."""
         step = belief.state.p_odom_imu - self.here
         carry = np.eye(6)
         carry[3:, :3] = -lie.hat(step)
@@ -100,7 +101,7 @@ class Certainty:
 
 
 def _by_mounting(state: NavState) -> F64:
-    """(6, 6) change of the IMU's pose by the mounting's error, odom axes."""
+    """(6, 6) change of the IMU's pose per error of the mounting, odom axes."""
     return np.asarray(_in_odom(state) @ mounting_to_pose(state))
 
 

@@ -19,7 +19,7 @@ JITTER_S = 0.5e-3
 TURN_RAD = 3e-3
 """Standard deviation of a scan's correction of a turn."""
 PRIOR = (TURN_RAD / USUAL_S) ** 2
-"""(rad/s)², changes of the rate that would tell as much as the prior."""
+"""(rad/s)²: sum of squared rate changes that carries as much information as the prior."""
 LARGEST_TURN, LARGEST_CHANGE = 0.05, 10.0
 """rad, rad/s: larger corrections or changes of the rate have another cause and are ignored."""
 

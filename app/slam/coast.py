@@ -1,11 +1,11 @@
-"""The update where the prediction does not tell the motion during a scan: there is no IMU, it has a gap, or the speed
-is not known yet.
+"""The update for a scan whose motion cannot be predicted: there is no IMU, its samples have a gap, or the speed is not
+known yet.
 
-Each point is compared with the map where the device was at the point's own time, so a scan determines rates and not
+Each point is compared with the map from the device's pose at the point's own time, so a scan determines rates and not
 only a pose (continuous-time ICP, Dellenbach et al. 2022, "CT-ICP").
 
-Without an IMU the device turns and moves on between two scans as fast as it did. The state then holds the rate of turn
-as the bias of a gyroscope that reads zero, and gravity is the normal of the floor where one is seen.
+Without an IMU, the speed and the rate of turn are assumed to stay the same between two scans. The state then holds the
+rate of turn as the bias of a gyroscope that reads zero, and gravity follows from the floor's normal if a floor is seen.
 """
 
 from dataclasses import dataclass, replace
@@ -22,34 +22,35 @@ from app.slam.sections import FilterParams
 from app.slam.types import F32, F64, NavState, Registration, Scan
 
 CHANGES = (1.0, 3.0)
-"""rad/s and m/s²: change of the rate of turn from a scan to the next, and acceleration, of a walking person's hand."""
+"""rad/s and m/s², of a walking person's hand: change of the rate of turn between two scans, and acceleration."""
 FIRST_SPEED, FIRST_RATE = 1.5, 1.0
 """m/s, rad/s: standard deviations before the first two scans are compared."""
 ADRIFT = 0.6
-"""m/s: standard deviation of the speed along a direction that four scans in a row have left open. A scan that holds all
-directions leaves half of that."""
+"""m/s: standard deviation of the speed along a direction that four scans in a row have left open. A scan that
+constrains all directions leaves half of that."""
 KNOT_S, LONGEST_S = 0.0025, 1.0
-"""How far poses in between are apart, and how long a scan lasts at most: a gap before it needs none."""
+"""s: time between two intermediate poses, and longest duration of a scan. A gap before the scan needs no such poses."""
 GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
-"""Of the residuals in each iteration, times the filter's gate; wide at first, since nothing measures the motion."""
+"""Gate of the residuals in each iteration, in multiples of the filter's; wide at first, as the motion is unknown."""
 CONVERGED_ROTATION, CONVERGED_TRANSLATION = 1e-4, 1e-3
 """rad, m: an increment below these ends the iteration."""
 ENOUGH_PLANES, ENOUGH_SHARE, WALKING = 50, 0.45, 0.3
-"""Fewer good planes than ENOUGH_PLANES, or above WALKING m/s than ENOUGH_SHARE of the points, are too few; then poor
-ones are used too. Where good ones leave a direction open, as in a bare corridor, poor ones must not hold the scan."""
+"""Good planes are too few if there are fewer than ENOUGH_PLANES or, above WALKING m/s, fewer than ENOUGH_SHARE of the
+points. Then poor planes are used too. If good planes are enough but leave a direction open, as in a bare corridor, poor
+planes must not constrain it."""
 UNSURE = 0.2
-"""m/s: standard deviation of the speed from which it is better found from the scan's own distortion than taken from the
-prediction: points are then off by over 1 cm."""
+"""m/s: above this standard deviation of the speed, the scan's own distortion shows the speed better than the prediction
+does: deskewed by the prediction, points would be off by over 1 cm."""
 UPRIGHT = np.array([[0.0, 0.0, 1.0]])
 FORWARD = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-"""What may be up in the LiDAR frame: of a scanner held upright, and of a hemispherical one that looks forward."""
+"""Possible up directions in the LiDAR frame: if held upright, and if a hemispherical scanner looks forward."""
 BELOW_DEG = -3.0
-"""A LiDAR that sees lower than this is one that is held upright."""
+"""A LiDAR that sees below this elevation is assumed to be held upright."""
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """How the device came to its pose at the end of a scan, seen from there, beside a motion at constant rates.
+    """Motion of the device during a scan, in addition to constant rates, relative to its pose at the end.
 
     Attributes:
         times: (k,) s before the end, ascending to 0. turned: (k, 3, 3) R_end_then. swayed: (k, 3) m.
@@ -63,10 +64,10 @@ class Course:
 
     @classmethod
     def steady(cls, begin_ns: int, end_ns: int) -> "Course":
-        """Nothing beside the constant rates: no turn, no sway, at times KNOT_S apart.
+        """Constant rates only: no additional turn or sway, at times KNOT_S apart.
 
         Args:
-            begin_ns, end_ns: of the motion; of one longer than LONGEST_S, the first time is followed by a gap.
+            begin_ns, end_ns: of the motion. If it is longer than LONGEST_S, the first interval is a gap.
         """
         dt = max((end_ns - begin_ns) * 1e-9, 1e-6)
         scan = min(dt, LONGEST_S)
@@ -77,7 +78,7 @@ class Course:
 
     @classmethod
     def measured(cls, path: Path, predicted: NavState) -> "Course":
-        """What the IMU measured along the path, which led to the predicted state."""
+        """As the IMU measured it along the path that led to the predicted state."""
         R, t = predicted.R_odom_imu, path.times[:, None]
         turned = R.T @ path.poses[:, :, :3] @ lie.exp(predicted.b_gyro * t)
         swayed = (path.poses[:, :, 3] - predicted.p_odom_imu - predicted.v_odom_imu * t) @ R
@@ -85,13 +86,13 @@ class Course:
 
 
 def begin(scan: Scan, params: Params) -> Belief:
-    """Belief at the first scan's begin; odom's z is the normal of the floor that the scan shows, if it shows one."""
+    """Belief at the beginning of the first scan. If the scan shows a floor, its normal is odom's z axis."""
     up = lie.from_rpy_degrees(params.sensor.rotation) @ _up(scan, params)
     return standing(scan.stamp_ns, lie.between(up, np.array([0.0, 0.0, 1.0])), params)
 
 
 def standing(stamp_ns: int, R_odom_imu: F64, params: Params) -> Belief:
-    """Belief of a device that rests at odom's origin, as far as is known: speed and rate of turn are wide open.
+    """Belief of a device at rest at odom's origin, but with very uncertain speed and rate of turn.
 
     Args:
         R_odom_imu: (3, 3), odom's z up; known to 1e-4 rad.
@@ -107,7 +108,7 @@ def standing(stamp_ns: int, R_odom_imu: F64, params: Params) -> Belief:
 
 
 def without_imu(belief: Belief) -> Belief:
-    """The belief where the rate of turn is unknown and gravity is known, as at the begin."""
+    """The belief with the rate of turn unknown and gravity known, as at the start."""
     covariance = belief.covariance.copy()
     for part, sigma in ((BG, FIRST_RATE), (GRAV, 1e-3)):
         covariance[part] = covariance[:, part] = 0.0
@@ -212,8 +213,8 @@ def update(
 
 
 def _up(scan: Scan, params: Params) -> F64:
-    """Up in the LiDAR frame: as such a scanner is usually held, made exact by the floor. The nearer plane is the floor,
-    the farther one a ceiling."""
+    """Up in the LiDAR frame: the usual direction for such a scanner, made exact by the floor. If two planes are found,
+    the nearer one is the floor and the farther one a ceiling."""
     heights = scan.points[:, 2] / np.maximum(np.linalg.norm(scan.points, axis=1), 1e-3)
     lowest = np.degrees(np.arcsin(np.percentile(heights, 0.5))) if len(heights) else 0.0
     guesses = UPRIGHT if lowest < BELOW_DEG else FORWARD

@@ -1,4 +1,4 @@
-"""What shows that a run cannot be right: no person moves like that, or the sensors contradict each other."""
+"""Signs that a run cannot be right: no person moves like that, or the sensors contradict each other."""
 
 import numpy as np
 
@@ -22,19 +22,19 @@ MOST_LOST, MOST_DROPPED = 0.1, 0.5
 WALKING = 0.1
 """m/s; a device at rest gives no evidence about its IMU."""
 TAKEN_BACK, NOISE = 0.07, 0.05
-"""Share of the velocity's change by the IMU that the scans may take back, beside NOISE m/s. A clean sensor leaves 0.01
-to 0.02, one with all the errors that data sheets admit 0.05; exchanged axes, a mounting off by 5 deg or a clock off by
-20 ms leave 0.07 to 0.4."""
+"""Share of the IMU's velocity changes that the scans may take back, beyond NOISE m/s. It is 0.01 to 0.02 for a clean
+sensor, 0.05 for one with all the errors that data sheets allow, and 0.07 to 0.4 with swapped axes, a mounting off by
+5 deg or a clock off by 20 ms."""
 OFTEN = 3
-"""Of frames in which the sensors contradict each other, or in which none shows the motion, so many are doubtful."""
+"""A run is doubtful if in this many frames the sensors contradict each other, or no sensor shows the motion."""
 UNCERTAIN = 0.2
-"""m: standard deviation of the position by the filter. Where scans show the motion it stays below 0.03."""
+"""m: the filter's standard deviation of the position. While scans show the motion, it stays below 0.03."""
 LATE_S = 0.01
-"""How late or early the IMU's clock may seem to be: data sheets and links admit 6 ms, and the estimate is off by 1."""
+"""How late or early the IMU's clock may seem: data sheets and links allow 6 ms, and the estimate is off by 1 ms."""
 
 
 def doubts(log: RunLog, tied_ns: I64 = NO_PAUSES) -> tuple[str, ...]:
-    """Why the trajectory cannot be right, a sentence each, with where it begins; empty if nothing speaks against it.
+    """Reasons why the trajectory cannot be right, one sentence each, with the time when it begins; empty if none.
 
     Args:
         tied_ns: (m,) ends of the pauses that loops span (`tied_pauses`).
@@ -133,7 +133,7 @@ def _of_imu(log: RunLog) -> list[str]:
 
 
 def _of_surprise(log: RunLog, times: F64) -> list[str]:
-    """Whether scans put the scanner elsewhere than the IMU, by more than the uncertainty of both."""
+    """Whether scans and IMU disagree about where the scanner is, by more than the uncertainty of both."""
     surprising = log.readout("surprise") > iekf.SURPRISING
     if np.count_nonzero(surprising) < OFTEN:
         return []

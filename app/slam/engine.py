@@ -42,13 +42,13 @@ class EngineProgress:
     """What one frame hands to the next, besides the map.
 
     Attributes:
-        frame: index of the next one. belief: None until the start is over. still: samples of the rest so far.
+        frame: index of the next frame. belief: None until the start is over. still: samples of the rest so far.
         T_odom_keyframe: T_odom_imu of the last keyframe. certainty: of its pose; both None before the first.
         floor: what is known of the floor around a scanner that sees none below itself; None before such a scan.
         lines, gyro, clock: estimated errors of the scan lines, of the gyroscope and of the IMU's clock.
-        paused: the pause after which there is no keyframe yet; None: there is none.
+        paused: the pause after which there is no keyframe yet; None if there is none.
         doubt: how far odometry may be off since the last keyframe.
-        ride: while a rest is awaited, where scans see the device if it rides evenly instead; else None.
+        ride: while the start waits for a rest, the belief by scans in case the device rides evenly instead; else None.
         bent: whether the map holds only one scan, deskewed at an unknown speed (`app.slam.fusion`).
     """
 
@@ -80,11 +80,11 @@ class EngineState:
 
 @dataclass(frozen=True, slots=True)
 class _Begun:
-    """From where a scan is predicted.
+    """The starting point for predicting a scan.
 
     Attributes:
         belief: before the scan; while waiting, at its end. samples: those that lead from there to the scan's end.
-        still: as `start.Started`. floor, paused: as in `EngineProgress`. notice: for the user; "" if none.
+        still: as in `start.Started`. floor, paused: as in `EngineProgress`. notice: for the user; "" if none.
         ride: before the scan, as in `EngineProgress`; None unless a longer rest is awaited.
     """
 
@@ -112,7 +112,7 @@ class Engine:
         keyframes: where to keep them; None: in a temporary file.
 
     Attributes:
-        params: used from the next step on; those that act on restart are read only once, here.
+        params: used from the next step on. Those that act on restart are read only when the engine is made.
         keyframes: the full map so far.
     """
 
@@ -124,9 +124,9 @@ class Engine:
         self._progress = EngineProgress()
 
     def step(self, scan: Scan, samples: ImuSamples) -> StepResult:
-        """Process one scan with the samples that cover the time from the previous scan's end to its own.
+        """Process one scan with the samples that cover the time from the previous scan's end to this scan's end.
 
-        Without any samples the velocities are taken to be constant.
+        Without any samples the velocities are assumed to be constant.
         """
         p, before, watch = self.params, self._progress, _Stopwatch()
         end_ns = scan.end_ns
@@ -142,7 +142,7 @@ class Engine:
         points.setflags(write=False)
         watch.lap("deskew")
 
-        # paper 2.2: the ground, and only the ground, is thinned before the filter's own scan voxel
+        # paper 2.2: the ground alone is downsampled first, then all points by the filter's scan voxel
         predicted = prediction.belief.state
         down = _down_in_lidar(predicted)
         surface = ground.segment(points, scan.ring, down, p.ground, begun.floor, predicted.T_odom_lidar)
@@ -245,21 +245,21 @@ class Engine:
         )
 
     def checkpoint(self) -> EngineState:
-        """The present state; of the keyframes only their number, since the store keeps them."""
+        """The present state. It holds only the number of keyframes, since the store keeps them."""
         return EngineState(self.params, self._progress, self._map.checkpoint(), len(self.keyframes))
 
     def restore(self, state: EngineState) -> None:
-        """Go back to (or, in another engine of the same recording, on from) a checkpoint."""
+        """Go back to a checkpoint, or continue from one of another engine of the same recording."""
         self.params, self._progress = state.params, state.progress
         self._map.restore(state.map)
         self.keyframes.truncate(state.keyframes)
 
     def close(self) -> None:
-        """Give the disk space of the keyframes back."""
+        """Release the disk space of the keyframes."""
         self.keyframes.close()
 
     def _begin(self, scan: Scan, samples: ImuSamples, end_ns: int) -> _Begun:
-        """Go on from the frame before, begin anew after a pause, or start."""
+        """Continue from the previous frame, begin anew after a pause, or start."""
         before, p = self._progress, self.params
         if before.belief is not None:
             paused = pause.before(scan, samples, before.belief.state.stamp_ns)
@@ -273,7 +273,7 @@ class Engine:
             )
             return _Begun(belief, samples, None, paused, notice=notice)
         if not len(samples):
-            self._map.clear()  # of what was seen while a rest was awaited
+            self._map.clear()  # drop what was mapped while waiting for a rest
             notice = "There is no IMU: motion is estimated from the LiDAR alone, less accurately."
             return _Begun(coast.begin(scan, p), samples, before.floor, notice=notice)
         started, ride = start.proceed(before.still, scan, samples, p), before.ride
@@ -282,11 +282,11 @@ class Engine:
             return _Begun(started.belief, samples, before.floor, still=started.still, ride=ride)
         if ride is not None and start.has_ridden(ride, started.belief):
             return _Begun(ride, samples, before.floor, notice=start.RIDING)
-        self._map.clear()  # of what was seen while a rest was awaited
+        self._map.clear()  # drop what was mapped while waiting for a rest
         return _Begun(started.belief, samples, before.floor, notice=started.notice)
 
     def _followed(self, ride: Belief, scan: Scan, samples: ImuSamples, clock_sigma: float) -> Fused:
-        """Where scans see the device at the scan's end, in case it does not rest although its IMU feels so."""
+        """The scan fused as if the device moved, in case it does not rest although its IMU suggests so."""
         p = self.params
         prediction = predict(ride, samples, scan.end_ns, p.imu, clock_sigma)
         points = prediction.deskew(scan)
@@ -295,7 +295,7 @@ class Engine:
         return fuse(prediction, scan, points, sampled.points, sampled.source, self._map, p, alike)
 
     def _alike(self, belief: Belief, samples: ImuSamples, end_ns: int) -> Prediction | None:
-        """The prediction for a scan that is as bent as the only one in the map; None if that one is not bent."""
+        """The prediction for a scan that is bent like the only scan in the map; None if that scan is not bent."""
         if not self._progress.bent:
             return None
         at_map_begin = imu.at_map_begin(belief, self.params.filter.estimate_extrinsics)
@@ -305,7 +305,7 @@ class Engine:
         return keyframes.is_due(self._progress.T_odom_keyframe, belief.state.T_odom_imu, self.params.keyframe)
 
     def _learnt(self, lines: LineErrors, belief: Belief, points: F32, rings: U16) -> LineErrors:
-        """What a scan that becomes a keyframe, but not the first, adds to what is known of the lines."""
+        """The line errors, updated with a scan that becomes a keyframe; the first keyframe changes nothing."""
         last = self._progress.T_odom_keyframe
         if last is None:
             return lines
@@ -338,7 +338,7 @@ class Engine:
 
 
 def _notices(begun: _Begun, last: FrameStatus, status: FrameStatus, fused: Fused, bent: bool) -> tuple[str, ...]:
-    """For the user. bent: as in `EngineProgress`, before this frame."""
+    """Notices for the user. bent: as in `EngineProgress`, before this frame."""
     notices = [begun.notice] if begun.notice else []
     if bent and not (begun.waiting or begun.paused or fused.bent or fused.anew):
         notices.append(start.GUESSED)
@@ -361,7 +361,7 @@ def _in_range(scan: Scan, params: SensorParams) -> Scan:
 
 
 def _kept(points: F32, labels: U8, scan: Scan) -> Cloud:
-    """A scan's deskewed points and the rest of it, none of which changes any more."""
+    """The cloud of a scan: its deskewed points with all else that is kept, now read-only."""
     for array in (points, labels):
         array.setflags(write=False)
     return Cloud(points, labels, scan.intensity, scan.ring, scan.offsets_ns)

@@ -1,4 +1,4 @@
-"""The one error that users read."""
+"""The one error class whose messages are written for users."""
 
 import shlex
 from pathlib import Path
@@ -19,7 +19,7 @@ def quoted(path: Path) -> str:
 
 
 def refusal(error: OSError) -> str:
-    """What the system would not do, in a sentence."""
+    """An error of the operating system, as a sentence."""
     where = f" ({error.filename})" if error.filename else ""
     return f"The system refused: {error.strerror or error}{where}; check space, permissions and limits (ulimit -a)."
 
@@ -29,7 +29,7 @@ class HemislamError(Exception):
 
     The message is one sentence that says what is wrong, where, and what to do. The command line
     prints it and exits with code 2; the page shows it as a notification and the session goes on.
-    What it quotes is shown escaped, and cut if it is long.
+    Control characters in it are escaped, and a long message is cut in the middle.
     """
 
     def __init__(self, sentence: str) -> None:

@@ -40,7 +40,7 @@ class Floor:
 
     @classmethod
     def unknown(cls, T_odom_lidar: F64) -> Self:
-        """Around this pose, before any scan."""
+        """The floor around this pose before any scan."""
         seen = np.tile(kernels.NOTHING, (2, CELLS, CELLS, 1))
         found = np.full((CELLS, CELLS), np.nan, np.float32)
         return cls(T_odom_lidar, _corner(T_odom_lidar), 0, seen, np.zeros((CELLS, CELLS, 2), np.float32), found)
@@ -68,7 +68,7 @@ class Floor:
         return replace(self, found=found), kinds, seeds[:count] @ R
 
     def label(self, points: F32, ring: U16, kinds: U8, params: GroundParams, labels: U8) -> int:
-        """Label the last scan's points by `found`; the number of points on the floor. See `kernels.label`."""
+        """Label the last scan's points by `found`. Returns the number of points on the floor; see `kernels.label`."""
         R, p = self.T_odom_lidar[:3, :3], self.T_odom_lidar[:3, 3]
         last = last_line(ring, params.scan_lines)
         return int(kernels.label(points, ring, last, R, p, self.corner, self.found, kinds, params.sigma, labels))

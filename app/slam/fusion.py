@@ -3,8 +3,9 @@
 Where the IMU tells how the device moved during the scan, the filter estimates the pose at its end (`iekf`). Otherwise
 the scan determines its own motion too (`coast`).
 
-A map that begins at an unknown speed begins with a bent scan. The next scan is bent alike and fits it as a rigid body.
-If that tells the speed in all directions, this scan is set straight and begins the map anew.
+If the speed is unknown when a map begins, the first scan in it is bent. The next scan is bent alike and fits the first
+as a rigid body. If this fit determines the speed in all directions, the second scan is straightened and begins the map
+anew.
 """
 
 import contextlib
@@ -28,11 +29,12 @@ NOT_REGISTERED = Registration(
 )
 
 BETTER, SAME_PART = 0.5, 0.9
-"""A scan that contradicts the IMU, and without it fits the map with at most this share of the residuals and at least
-this share of the points, shows that the IMU was wrong about the whole scan: it was knocked, or froze."""
+"""If a scan contradicts the IMU and is fused again without it, the map may fit better: with at most this share of the
+residuals and at least this share of the points. Then the IMU was wrong about the whole scan: it was knocked, or froze.
+"""
 
 TOLD = 0.5
-"""m/s: a speed that is known better than this is told by the scans. It is a third of what a start in motion assumes."""
+"""m/s: if the speed is known better than this, scans have determined it. A start in motion assumes three times this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +45,7 @@ class Fused:
     lost: whether the pose is a guess: the scan met too few planes, or nothing measures the speed any more.
     imu_wrong: whether the scan shows that the IMU was wrong about how the device moved during it.
     bent: whether the points were deskewed at an unknown speed and begin the map.
-    anew: whether the map, which held such points, is to begin anew with these.
+    anew: whether the map held such points and is to begin anew with these.
     """
 
     belief: Belief
@@ -66,12 +68,12 @@ def fuse(
     params: Params,
     alike: Prediction | None = None,
 ) -> Fused:
-    """The prediction, corrected by a scan; unchanged if the map is empty or too little of it is met.
+    """The prediction, corrected by a scan; unchanged if the map is empty or the scan matches too little of it.
 
     Args:
         scan: as measured. points: (n, 3) m, deskewed by the prediction.
         sampled: (m, 3) m, the same, thinned. source: (m,) which points of the scan these are nearest to.
-        alike: if the map holds one bent scan, the same prediction from a pose that is known, where that scan ended.
+        alike: if the map holds one bent scan, the same prediction, but with the pose where that scan ended as known.
     """
     if not local_map.voxels:
         unknown = prediction.covered and coast.is_unsure(prediction.belief)
@@ -108,7 +110,7 @@ def _with_imu(prediction: Prediction, sampled: F32, local_map: LocalMap, params:
 def _by_scan(
     prediction: Prediction, course: Course, scan: Scan, source: I32, local_map: LocalMap, params: Params
 ) -> Fused:
-    """From the measured points themselves, since centroids have no time."""
+    """The scan fused by `coast`. It takes the measured points, since centroids have no time."""
     refines = params.filter.estimate_extrinsics and not prediction.gap
     update = partial(coast.update, prediction.belief, scan.part(source), course, local_map, params.filter, refines)
     posterior, registration = _attempted(prediction.belief, update)
@@ -123,7 +125,7 @@ def _by_scan(
 def _straight(
     alike: Prediction | None, scan: Scan, sampled: F32, source: I32, local_map: LocalMap, params: Params
 ) -> Fused | None:
-    """The scan, set straight by the speed that a map bent alike shows.
+    """The scan, straightened by the speed that follows from matching it to a map that is bent alike.
 
     None if the map is not bent, or if some direction of the speed stays a guess.
     """
@@ -140,7 +142,7 @@ def _straight(
 
 
 def _better(fused: Fused, even: Prediction, scan: Scan, source: I32, local_map: LocalMap, params: Params) -> Fused:
-    """The scan fused without the IMU's word on how it bent the scan, if it then fits the map much better."""
+    """The scan fused without the motion that the IMU measured during it, if it then fits the map much better."""
     assert even.course is not None
     again = _by_scan(even, even.course, scan, source, local_map, params)
     first, second = fused.registration, again.registration
@@ -153,7 +155,7 @@ def _better(fused: Fused, even: Prediction, scan: Scan, source: I32, local_map: 
 
 
 def _attempted(predicted: Belief, update: Callable[[], tuple[Belief, Registration]]) -> tuple[Belief, Registration]:
-    """What the update gives; after a numerical failure, the prediction stands and the frame is lost."""
+    """The result of the update; after a numerical failure, the prediction stands and the frame is lost."""
     with contextlib.suppress(np.linalg.LinAlgError):
         posterior, registration = update()
         if np.isfinite(posterior.covariance).all() and np.isfinite(posterior.state.T_odom_imu).all():

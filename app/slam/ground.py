@@ -32,7 +32,7 @@ def segment(
         points: (n, 3) float32 m, LiDAR frame.
         ring: (n,) rank of each point's scan line by elevation; 0 is the outermost.
         down: (3,) unit, direction of gravity in the LiDAR frame.
-        known: the floor by the scans before. T_odom_lidar: (4, 4); None for a lone scan.
+        known: the floor from earlier scans. T_odom_lidar: (4, 4); None for a lone scan.
 
     Returns:
         Labels and the plane. Without an acceptable plane every label is NON_GROUND, and `reason` says why.
@@ -91,7 +91,7 @@ def _plane(result: GroundResult, mean: F64, covariance: F64, params: GroundParam
 
 
 def _on_floor(points: F32, ring: U16, params: GroundParams, none: GroundResult) -> GroundResult:
-    """The labels by cells of the floor, and the plane of those that are its seeds. none: without any labels."""
+    """The result by cells of the floor: labels, and the plane of the cells that are seeds. none: without any labels."""
     T_odom_lidar = none.T_odom_lidar
     if T_odom_lidar is None:
         T_odom_lidar = lie.transform(lie.between(none.down, np.array([0.0, 0.0, -1.0])), np.zeros(3))

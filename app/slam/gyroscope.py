@@ -1,8 +1,8 @@
-"""How far the gyroscope's scales are off, estimated from how scans correct the predicted turns.
+"""Scale errors of the gyroscope, estimated from how scans correct the predicted turns.
 
-A gyroscope that reads a turn too short by a share of it falls short in every turn about that axis, and the scan's
-correction adds what is lacking. A regression over many frames gives the shares. Only their symmetric part is learnt:
-the antisymmetric one turns all axes together, as an error of the mounting does, which the filter refines.
+If the scale of an axis is too small, every turn about this axis is measured too short by the same share, and the scan's
+correction adds the rest. A regression over many frames gives the shares. Only their symmetric part is learnt: the
+antisymmetric part turns all axes together, like an error of the mounting, which the filter refines.
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,7 +16,7 @@ from app.slam.types import F64, ImuSamples, NavState
 GYRO_SCALE = 0.006
 """Possible error of a turn, as a share: of scale and between the axes [data sheets of MEMS gyroscopes]."""
 PRIOR = (TURN_RAD / GYRO_SCALE) ** 2 * np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-"""rad², turns that would tell as much as the prior. Shares between two axes stand twice in the matrix."""
+"""rad²: sum of squared turns that carries as much information as the prior. Shares between two axes count twice."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from app.slam.types import F32, F64, Matches, NavState, Registration
 
 RESEARCH_ROTATION = 1e-3
 RESEARCH_TRANSLATION = 1e-2
-"""rad, m: planes are searched again once the state moved by more than this."""
+"""rad, m: planes are searched again once the state has moved by more than this."""
 CONVERGED_ROTATION = 1e-5
 CONVERGED_TRANSLATION = 1e-4
 """rad, m: an increment below these ends the iteration."""
@@ -27,9 +27,9 @@ MIN_INLIERS = 30
 """Least number of planes for an update; with fewer the prediction stands."""
 OPEN_SIGMA = 0.03
 """m (rotation: as below): if good planes leave a direction less certain than this, poor ones are used too, weighted by
-their certainty. In a park all good planes lie on the ground, and only trunks hold the scanner along it."""
+their certainty. In a park all good planes lie on the ground, and only trunks constrain the position along it."""
 MANY_PLANES = 0.45
-"""Share of a scan's points with a plane from which on the scan is trusted where it contradicts the IMU."""
+"""If at least this share of a scan's points has a plane, the scan is trusted where it contradicts the IMU."""
 SURPRISING = 4.0
 """Surprise of a frame (`Registration`) above which the scan and the IMU contradict each other. Clean sensors stay below
 0.3, imperfect ones below 3.5; where scans show little but people and false points, it reaches 5 to 89."""
@@ -153,7 +153,7 @@ def is_imu_to_blame(registration: Registration) -> bool:
 
 
 def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
-    """Normal equations without the directions in which normals' errors explain more than all that the points tell."""
+    """The normal equations without directions in which the normals' errors outweigh the information of the points."""
     with contextlib.suppress(np.linalg.LinAlgError):
         np.linalg.cholesky(H)  # raises if there is one; faster than the eigenvalues
         return H, b
@@ -164,7 +164,7 @@ def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
 
 
 def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:
-    """How an update went that found too few planes to change the state.
+    """The result of an update that found too few planes to change the state.
 
     Args:
         iterations: begun so far. used: points compared with the map. inliers: those that found a plane.
@@ -174,7 +174,7 @@ def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Regis
 
 
 def outcome(points: F32, H: F64, converged: bool, iterations: int, stats: F64, matches: Matches) -> Registration:
-    """How an update went.
+    """The result of an update.
 
     Args:
         points: (n, 3) m, LiDAR frame. H: (6, 6) information of the scan alone on rotation (rad) and position (m).
@@ -197,7 +197,7 @@ def _eigenvalues(points: F32, H: F64) -> F64:
 
 
 def matches(points: F32, residuals: F64, planes: Planes) -> Matches:
-    """By point, what was looked up."""
+    """The points that were looked up, with the residual and plane of each."""
     found_at = Matches(points.copy(), *(a.astype(np.float32) for a in (residuals, planes.normals, planes.centers)))
     for array in (found_at.points, found_at.residuals, found_at.normals, found_at.centers):
         array.setflags(write=False)

@@ -22,19 +22,19 @@ POSE, MOTION, EXT = slice(0, 6), slice(0, 9), slice(17, 23)
 """Pose; pose and velocity; extrinsics."""
 
 MAX_KNOT_STEP = 0.0025
-"""s; poses in between are interpolated linearly."""
+"""s between two poses of a path; poses in between are interpolated linearly."""
 LONG_GAP = 0.4
 """s, half the time of a step. Over a longer gap the accelerations at both ends do not determine the velocity."""
 GAP_RATE, GAP_NOISE = 1.0, 1.0
-"""rad/s, m/s²/√Hz: in a gap, standard deviation of the rate of turn and noise density of the acceleration; those of a
+"""rad/s, m/s²/√Hz: in a gap, standard deviation of the rate of turn and noise density of the acceleration, as of a
 walking person's hand."""
 
 KNOWN = 1e-4
 """rad, m: standard deviation of a pose that defines odom, or at which the map begins."""
 WALKING = 1.5
-"""m/s: standard deviation of a walking person's velocity while nothing is known of it."""
+"""m/s: standard deviation of a walking person's velocity while nothing is known about it."""
 BIAS_LEAPS = 0.005, 0.05
-"""rad/s, m/s²: how far the biases of a consumer IMU may leap by a knock or a restart. Larger leaps take more frames."""
+"""rad/s, m/s²: how far a knock or a restart may shift the biases of a consumer IMU. Larger shifts take more frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ def _turn_error(belief: Belief) -> float:
 
 
 def _unsteady(times: F64, rates: F64, forces: F64, clock_sigma: float, turn_error: float) -> F64:
-    """Noise densities (2,) (rad/s/√Hz, m/s²/√Hz) that have the effect of clock and turn errors over these (k,) s.
+    """Noise densities (2,) (rad/s/√Hz, m/s²/√Hz) with the same effect as clock and turn errors over these (k,) s.
 
     rates, forces (k, 3) rad/s, m/s². A clock late by c gives an angle wrong by c times the change of the rate. At rest
     both errors are harmless, and only the noise of the data sheet remains.
@@ -192,8 +192,8 @@ def after_gap(belief: Belief, before: Belief) -> Belief:
 def with_open_motion(belief: Belief, surprise: float) -> Belief:
     """The belief with a covariance of pose and speed as large as the scan's `surprise` (see `Registration`) says.
 
-    Every direction opens in proportion to what is not known of it. One that the scan leaves open therefore stays if it
-    was known a moment ago, and moves if it has been unknown for long.
+    The covariance grows in proportion to the present one. So, along a direction that the scan leaves open, the estimate
+    stays if it was well known a moment ago, and moves if it has been uncertain for long.
     """
     opened = np.ones(DIM)
     opened[MOTION] = np.sqrt(surprise)
@@ -201,7 +201,7 @@ def with_open_motion(belief: Belief, surprise: float) -> Belief:
 
 
 def with_open_biases(belief: Belief) -> Belief:
-    """The belief after a scan has contradicted the IMU, whose biases may have leapt."""
+    """The belief after a scan has contradicted the IMU, whose biases may have shifted."""
     covariance = belief.covariance.copy()
     for bias, leap in zip((BG, BA), BIAS_LEAPS, strict=True):
         covariance[bias, bias] += leap**2 * np.eye(3)

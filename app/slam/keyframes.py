@@ -56,11 +56,11 @@ class KeyframeStore:
     `store[i]` reads keyframe i, from any thread; iterating streams all of them in order.
 
     Args:
-        path: of the file; whole keyframes that it holds already are there. None: a temporary one.
+        path: of the file; complete keyframes that it already holds are kept. None: a temporary file.
     """
 
     def __init__(self, path: Path | None = None) -> None:
-        self._ends = array("q")  # file offset after each keyframe, also of those gone back over
+        self._ends = array("q")  # file offset after each keyframe, including later ones after going back
         self._file: IO[bytes]
         if path is None:
             self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-")  # noqa: SIM115 - closed by close()
@@ -71,7 +71,7 @@ class KeyframeStore:
         self._count = len(self._ends)
 
     def _find(self, size: int) -> None:
-        """Find the keyframes of a file of `size` bytes; one that was torn at its end is not there."""
+        """Find the keyframes of a file of `size` bytes; an incomplete one at the end is ignored."""
         end = 0
         while end + _HEAD.itemsize <= size:
             raw = os.pread(self._file.fileno(), _HEAD.itemsize, end)
@@ -137,8 +137,8 @@ class KeyframeStore:
 
         A store that never held any stays empty.
 
-        What is appended after going back must be what was there, or going forth again beyond it
-        mixes keyframes of two different runs.
+        After going back, append the same keyframes as before; otherwise, going forward beyond them
+        would mix keyframes of two different runs.
 
         Raises:
             IndexError: there is no such keyframe, or another one has replaced it since.
@@ -150,5 +150,5 @@ class KeyframeStore:
         self._count = count
 
     def close(self) -> None:
-        """Give the disk space back."""
+        """Release the disk space."""
         self._file.close()

@@ -12,13 +12,13 @@ from app.slam.sections import FilterParams, MapParams
 from app.slam.types import F32, F64, I32, U8
 
 DRIFT_M = 15.0
-"""m: walking this far, odometry is taken to drift by the RMS distance of the scans' points from the map's planes."""
+"""m: over this distance, odometry is taken to drift by the RMS distance of the scans' points from the map's planes."""
 OLD_M = 0.025
-"""m: a surface is old once odometry may have drifted so far since it was last seen."""
+"""m: a surface is old once odometry may have drifted this far since it was last seen."""
 RELAXED = 4.0
 """Tilt allowed to a poor plane, as a multiple of that of a good one."""
 PART = 128
-"""Points for which one thread searches planes at a time, which takes some 0.2 ms."""
+"""Points for which one thread searches planes at a time; this takes about 0.2 ms."""
 
 
 @dataclass(frozen=True, slots=True)

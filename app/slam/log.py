@@ -49,7 +49,7 @@ class Log(Generic[T]):
 
     @property
     def cursor(self) -> Cursor:
-        """That of a reader that has everything."""
+        """The cursor of a reader that has everything."""
         return Cursor(len(self._cuts), len(self._rows))
 
     def append(self, row: T) -> None:

@@ -1,4 +1,4 @@
-"""Where odometry lies in the map: the corrections that loops make, keyframe by keyframe."""
+"""The transform from odometry to the map: the corrections that loops make, keyframe by keyframe."""
 
 from dataclasses import dataclass, field
 
@@ -27,7 +27,7 @@ class MapFrame:
 
     @classmethod
     def levelling(cls, g_map: F64) -> "MapFrame":
-        """The turn about the origin, not in heading, that makes gravity, (3,) in the map so far, point along -z."""
+        """The rotation about the origin, not in heading, that makes gravity, (3,) in the map so far, point along -z."""
         down = np.array([0.0, 0.0, -1.0])
         turn = lie.transform(lie.between(g_map, down), np.zeros(3))
         return cls(np.zeros(1, np.int64), turn[None]) if np.cross(g_map, down).any() else cls()
@@ -72,10 +72,10 @@ class MapFrame:
 def corrected(
     stamps_ns: I64, T_odom_imu: F64, keyframe_stamps_ns: I64, corrections: F64, pauses_ns: I64 = NO_PAUSES
 ) -> F64:
-    """(n, 4, 4) T_map_imu of frames, their corrections interpolated by time between the keyframes' ones.
+    """(n, 4, 4) T_map_imu of frames, by the keyframes' corrections interpolated in time.
 
-    Before the first keyframe its correction holds, after the last one that one's; with none, odometry stays.
-    Across a pause nothing is interpolated: on either side the nearest keyframe's correction holds.
+    Before the first keyframe its correction applies, after the last keyframe that of the last; without keyframes,
+    odometry stays. Across a pause nothing is interpolated: each side takes the correction of its nearest keyframe.
 
     Args:
         stamps_ns: (n,) of the frames. T_odom_imu: (n, 4, 4).
@@ -91,8 +91,8 @@ def corrected(
     share = np.clip(passed / np.where(between > 0, between, 1.0), 0.0, 1.0)
     begun, ended = (np.searchsorted(pauses_ns, keyframe_stamps_ns[side]) for side in (before, after))
     share = np.where(begun < ended, np.searchsorted(pauses_ns, stamps_ns, side="right") == ended, share)
-    # interpolated between the corrected poses' differences from odometry AT the frame, so that a correction far from
-    # the origin, a turn and a large shift that nearly cancel, does not swing in between
+    # Corrections are expressed AT the frame's position before they are interpolated. About the origin, a correction of
+    # a distant pose is a turn and a large shift that nearly cancel, and their interpolation would swing in between.
     here = T_odom_imu.copy()
     here[:, :3, :3] = np.eye(3)
     first = lie.inverse(here) @ corrections[before] @ here

@@ -208,7 +208,7 @@ def rpe(estimate: Trajectory, truth: Trajectory, *, frames: int = 1, metres: flo
 
 
 def drift(estimate: Trajectory, truth: Trajectory, metres: float) -> F64:
-    """(n,) per cent of the true path by which the motion over `metres` of it is wrong, as KITTI's (Geiger et al. 2012).
+    """(n,) errors of the motion over `metres` of true path, in per cent of it, as KITTI defines (Geiger et al. 2012).
 
     Every tenth pose begins a piece, so pieces overlap. Empty if the path is too short.
 
@@ -235,7 +235,7 @@ def compare(estimate: Trajectory, truth: Trajectory, *, rotations: bool = True) 
     """ATE, and RPE over each of RPE_OVER, as a tree for JSON. Lengths in m, angles in degrees.
 
     Args:
-        rotations: whether the truth's orientations are known in the IMU's axes; without, errors of rotation are None.
+        rotations: whether the truth's orientations are known in the IMU's axes; if not, errors of rotation are None.
 
     Raises:
         HemislamError: as `ate`.

@@ -1,8 +1,8 @@
-"""Points on what moves: those of a keyframe through whose place the keyframes around it see.
+"""Points on moving objects: those points of a keyframe whose places other keyframes around it see through.
 
-A person who walks by stands in no other keyframe where he stood in this one; the beams of the others pass there and
-return from behind. A wall returns wherever it is looked at. Both are counted for each small voxel. What a keyframe
-sees of a place depends on its own pose only as far as odometry drifts within a few metres, so loops change nothing.
+A person who walks by is at a place in one keyframe only: in other keyframes, beams pass through this place and return
+from behind it. A wall is hit by the beams of every keyframe. Both cases are counted for each small voxel. Only nearby
+keyframes are compared, with their odometry, which drifts little within a few metres. So loops change nothing.
 """
 
 import math
@@ -19,26 +19,26 @@ from app.slam.sections import MovingParams
 from app.slam.types import F32, F64, I32, Keyframe, Mask
 
 AROUND: Final = 10
-"""Keyframes before, and as many after, that look at a keyframe's points."""
+"""Number of keyframes before, and again after, that check a keyframe's points."""
 REACH: Final = 25.0
-"""m: farther points are not judged, for there scan lines lie too far apart."""
+"""m: farther points are not judged, because scan lines are too far apart there."""
 VOXEL: Final = 0.15
 """m: points of a voxel are judged together."""
 BIN: Final = math.radians(1.0)
-"""Width of the directions that share a range: beams of most scanners are closer than twice that."""
+"""Width of a bin of directions, which share one range: beams of most scanners are closer than twice that."""
 WIDE: Final = 2 * (int(2.0 / BIN) + 1 + kernels.RING)
 """Bins on each side of an image that holds all directions."""
 MARGIN: Final = 0.1
 SLACK: Final = 0.01
-"""m, and share of the range, by which a return may lie off a place and still be at it."""
+"""m, and share of the range: a return this close to a place still counts as at it."""
 SHARE: Final = 0.7
-"""Of the keyframes that know about a place, so many must see through it."""
+"""At least this share of the keyframes that know about a place must see through it."""
 NEIGHBOURHOOD: Final = 0.4
-"""m: surroundings of a voxel."""
+"""m: radius of a voxel's surroundings."""
 COMPANY: Final = 3
-"""Moving voxels in its surroundings, with itself, that a moving one needs: lone ones are stray returns at edges."""
+"""A moving voxel needs this many moving voxels around it, itself included: lone ones are stray returns at edges."""
 NEIGHBOURS: Final = 2
-"""Moving voxels, and no fewer than standing ones, that make an undecided one in their surroundings move too."""
+"""An undecided voxel moves too if at least this many voxels around it move, and no fewer than stand still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,20 +50,20 @@ class Sight:
 
 
 def sight(keyframe: Keyframe) -> Sight:
-    """Half a megabyte of ranges by direction."""
+    """The ranges of a keyframe by direction: half a megabyte."""
     image = np.empty((WIDE, WIDE, 2), np.float32)
     kernels.look(keyframe.cloud.points, BIN, image)
     return Sight(keyframe.T_odom_imu @ keyframe.T_imu_lidar, image)
 
 
 def around(index: int, count: int) -> list[int]:
-    """The keyframes that look at a keyframe's points, of `count` that there are, nearest first."""
+    """The indices, out of `count`, of the keyframes that check a keyframe's points, nearest first."""
     near = [place for step in range(1, AROUND + 1) for place in (index - step, index + step)]
     return [place for place in near if 0 <= place < count]
 
 
 def find(keyframe: Keyframe, others: Sequence[Sight], params: MovingParams) -> Mask:
-    """(n,) whether each point of a keyframe is on something that moves.
+    """(n,) whether each point of a keyframe is on a moving object.
 
     Args:
         others: the keyframes around it, nearest first.
@@ -98,6 +98,6 @@ def _near(places: F32, others: F32) -> I32:
     """How many of the others are in the surroundings of each place."""
     if not len(places) or not len(others):
         return np.zeros(len(places), np.int32)
-    # asked once, so it is to be built fast
+    # queried only once, so it must be fast to build
     tree: Any = KDTree(others, 24, compact_nodes=False, balanced_tree=False)  # type: ignore[no-untyped-call]  # no types
     return np.asarray(tree.query_ball_point(places, NEIGHBOURHOOD, return_length=True), np.int32)

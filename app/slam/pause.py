@@ -1,8 +1,8 @@
 """A pause of both sensors in the middle of a recording, as when the recorder was paused: the local map begins anew.
 
-How the device moved meanwhile is a guess. It goes on from the last pose, tilted as the accelerometer shows; loops then
-tie what it sees to what was mapped before. The acceleration of a walk hides gravity at first. Once
-the filter knows its direction, odom is levelled, the map begins once more, and keyframes go on.
+How the device moved meanwhile is unknown. The pose continues from the last one, with the tilt that the accelerometer
+shows; loops then tie the new map to what was mapped before. At first, the acceleration of walking hides gravity. Once
+the filter knows gravity's direction, odom is levelled, the map begins once more, and keyframes resume.
 """
 
 from dataclasses import dataclass, replace
@@ -17,11 +17,11 @@ from app.slam.start import BEFORE_NS
 from app.slam.types import ImuSamples, Scan
 
 PAUSE_S = 1.5
-"""Of neither scans nor IMU samples. After less, the motion is bridged to centimetres."""
+"""Longest gap in both scans and IMU samples that is not a pause: the motion is bridged to within centimetres."""
 TILTED = 0.15
 """rad: standard deviation of the direction of gravity as a walking person's accelerometer shows it in one scan."""
 SETTLED_S = 2.0
-"""Of a walk, four steps. Then the filter knows the direction of gravity to about a degree."""
+"""Duration of four steps. By then the filter knows the direction of gravity to about a degree."""
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -47,17 +47,17 @@ def before(scan: Scan, samples: ImuSamples, last_ns: int) -> Interruption | None
 
 
 def is_over(pause: Interruption, now_ns: int) -> bool:
-    """Whether odom can be levelled, and keyframes go on."""
+    """Whether odom can be levelled, and keyframes can resume."""
     return now_ns - pause.end_ns > SETTLED_S * 1e9
 
 
 def resumed(
     last: Belief, pause: Interruption, scan: Scan, samples: ImuSamples, params: Params
 ) -> tuple[Belief, ImuSamples]:
-    """The belief at the scan's begin, and the samples to go on with: those after the pause.
+    """The belief at the beginning of the scan, and the samples to continue with: those after the pause.
 
-    What is known of the sensors is kept. If the IMU is still silent, its earlier samples are returned, and if there is
-    none, the rate of turn, which stands in for the gyroscope's bias (`coast`), is unknown again.
+    What is known about the sensors is kept. While the IMU is silent, its earlier samples are returned. If there is no
+    IMU, the rate of turn, which stands in for the gyroscope's bias (`coast`), is unknown again.
     """
     state, later = last.state, samples.stamps_ns > max(pause.begin_ns, scan.stamp_ns - BEFORE_NS)
     sigma = np.zeros(DIM)
@@ -85,7 +85,7 @@ def resumed(
 
 
 def levelled(belief: Belief) -> Belief:
-    """The same, with odom turned about the device's place so that gravity points straight down."""
+    """The same, with odom turned about the device's position so that gravity points straight down."""
     state = belief.state
     turn = lie.between(-state.g_odom, UP)
     down = turn @ state.g_odom

@@ -27,7 +27,7 @@ def header(vertex: np.dtype, count: int, *comments: str, keyframe: np.dtype | No
 
 
 def pcd_header(kind: np.dtype, count: int, comment: str, viewpoint: str = "0 0 0 1 0 0 0") -> bytes:
-    """The header of `count` points as binary PCD 0.7. viewpoint: x y z qw qx qy qz. As long for every count."""
+    """The header of `count` points as binary PCD 0.7. viewpoint: x y z qw qx qy qz. Its length is fixed."""
     kinds = [kind[name] for name in kind.names or ()]
     lines = [
         f"# .PCD v0.7 - {comment}",

@@ -24,7 +24,7 @@ MOST_NOTED = 5
 def make_report(
     log: RunLog, trajectory: Trajectory, info: RunInfo, sha256: str | None, tied_ns: I64 = NO_PAUSES
 ) -> dict[str, Any]:
-    """What report.json holds of a trajectory; numbers that do not exist are NaN or None.
+    """The content of report.json for a trajectory; numbers that do not exist are NaN or None.
 
     Args:
         sha256: of the recording, as `hash_input`. tied_ns: as in `doubts`.
@@ -97,7 +97,7 @@ def finite(value: Any) -> Any:
 
 
 def summarise(report: dict[str, Any], folder: Path) -> str:
-    """The report in a few lines; what speaks against the result comes first and last."""
+    """The report in a few lines; reasons to doubt the result come first and last."""
     warning = [("WARNING", f"the result is doubtful: {' '.join(report['doubts'])}")] if report["doubts"] else []
     frames, ground, loops, accuracy = (report[name] for name in ("frames", "ground", "loops", "accuracy"))
     total, points = report["timings_ms"]["total"], report["map"]
@@ -141,7 +141,7 @@ def summarise(report: dict[str, Any], folder: Path) -> str:
 
 
 def _noted(notices: dict[str, int]) -> list[str]:
-    """Notices with their counts, the most frequent first. Those that differ in numbers alone are one: the first."""
+    """Notices with their counts, the most frequent first. Of those that differ only in numbers, the first is shown."""
     alike: dict[str, list[str]] = {}
     for notice in notices:
         alike.setdefault(re.sub(r"\d+", "", notice), []).append(notice)

@@ -27,15 +27,15 @@ from app.slam.types import ImuSamples, Scan
 LEAST_STILL = 0.3
 """s; a shorter rest does not determine the gyroscope's bias."""
 BEFORE_NS = 100_000_000
-"""Earlier samples than this before the first scan do not count: the device may have lain elsewhere."""
+"""Samples earlier than this before the first scan are ignored: the device may have been elsewhere."""
 DRAWN = 0.007, 0.005
-"""rad, m: standard deviations about and along each axis of a mounting from a drawing: 0.7 deg and 9 mm off in all."""
+"""rad, m: standard deviations about and along each axis of a mounting from a drawing: 0.7 deg and 9 mm in total."""
 
 RIDDEN = 0.2, 0.05
-"""m, rad: a device that scans see this far from where it was is not at rest. At rest among people and with imperfect
-sensors they see it within 0.1 and 0.03."""
+"""m, rad: if scans show that the device moved this far, it is not at rest. For a device at rest among people and with
+imperfect sensors, they show less than 0.1 and 0.03."""
 SURE = 5.0
-"""Standard deviations by which it must have moved: scans may leave a direction open, as along a corridor."""
+"""The motion must also exceed this many standard deviations: scans may leave a direction open, as along a corridor."""
 GUESSED = (
     "The first scans do not show the speed in every direction. If the map is off near its beginning, begin at rest or "
     "some seconds earlier or later."

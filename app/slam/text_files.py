@@ -1,4 +1,4 @@
-"""Files that this program writes: free names, tables as CSV, and texts that are complete or not there."""
+"""Files that this program writes: free names, tables as CSV, and text files that are complete or absent."""
 
 import contextlib
 import csv
@@ -11,7 +11,7 @@ from pathlib import Path
 from app.slam.errors import HemislamError
 
 _LONGEST = 180
-"""Bytes of a name to which more is added; file systems take 255."""
+"""Most bytes of a name that will be extended; file systems allow 255."""
 
 
 def csv_text(*rows: Iterable[object]) -> str:
@@ -28,21 +28,21 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
 
 
 def shortened(name: str) -> str:
-    """A name, without its end where that leaves no room in the name of a file for what is added to it."""
+    """A name, cut at its end if it is so long that a file name would have no room for an extension."""
     while len(os.fsencode(name)) > _LONGEST:
         name = name[:-1]
     return name
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file: none has a name that is too long for the file system."""
+    """Whether this file exists; false if its name is too long for the file system."""
     with contextlib.suppress(OSError):
         return path.is_file()
     return False
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """What had to be made for it to be there, the folder itself first. Raises HemislamError if it cannot be made."""
+    """Make a folder and return all folders that had to be made, itself first. Raises HemislamError if that fails."""
     try:
         new = [one for one in (folder, *folder.parents) if not one.exists()]
         folder.mkdir(parents=True, exist_ok=True)

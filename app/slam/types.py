@@ -286,7 +286,7 @@ class Keyframe:
         T_odom_imu: (4, 4) pose by odometry. T_imu_lidar: (4, 4) at that moment.
         covariance: (6, 6) of the pose against the local map, rotation (IMU frame) then translation (odom).
         cloud: in the LiDAR frame at `stamp_ns`, from which its `offsets_ns` count, <= 0.
-        drift: (6, 6) what adds to it since the first keyframe.
+        drift: (6, 6) what drift since the first keyframe adds to `covariance`.
         resumed_ns: when the scans went on, if it is the first after a pause (`app.slam.pause`); otherwise 0.
         astray: m, standard deviation by which odometry may be off since the last keyframe, if a scan contradicted it;
             otherwise 0.
@@ -320,12 +320,12 @@ TIMINGS = (*STAGES, "total")
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """All that processing one frame gave.
+    """The result of processing one frame.
 
     Attributes:
         index: frame number from 0. stamp_ns: scan end, the time of `state`.
         T_map_odom: (4, 4). The pose in the map is T_map_odom @ state.T_odom_imu.
-        cloud: deskewed points with labels. ground, registration: how those went.
+        cloud: deskewed points with labels. ground, registration: results of these steps.
         points_in: points of the scan. points_reduced: after ground downsampling.
         points_filter: after the scan voxel, as the filter gets them.
         timings_ms: of STAGES and "total". keyframe: if this frame became one.

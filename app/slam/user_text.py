@@ -16,11 +16,11 @@ TextRows = list[tuple[int, list[str]]]
 
 
 class _TwiceError(yaml.MarkedYAMLError):
-    """A name stands twice in one section."""
+    """A name appears twice in one section."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that stands twice; YAML forbids it, and otherwise the first value would be lost."""
+    """Refuses a key that appears twice; YAML forbids it, and otherwise the first value would be lost."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         names = set()
@@ -39,7 +39,7 @@ def read_yaml(text: str, source: str, hint: str) -> Any:
         source: file or other origin of the text. hint: how to write it, for the error message.
 
     Raises:
-        HemislamError: the text is not valid YAML, or a name stands twice in one section of it.
+        HemislamError: the text is not valid YAML, or a name appears twice in one section of it.
     """
     try:
         return yaml.load(text, _Loader)
@@ -71,7 +71,7 @@ def read_assignments(texts: Iterable[str], option: str, example: str) -> dict[st
 
 
 def read_numbers(texts: Iterable[str], names: Sequence[str], least: float = -math.inf) -> dict[str, float]:
-    """Finite numbers by name from texts `name=value`. Raises HemislamError: a name is unknown, or its value is none."""
+    """Finite numbers by name from texts `name=value`. Raises HemislamError: a name or value is invalid."""
     values = {}
     for text in texts:
         name, _, value = text.partition("=")
