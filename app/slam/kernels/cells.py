@@ -1,4 +1,4 @@
-"""Points in a cone; points sorted by cubes: the number around a point, and the distance of two clouds there."""
+"""Points in a cone. Points sorted by cubes: how many are around a point, and how far two clouds are apart there."""
 
 import math
 
@@ -175,7 +175,7 @@ def distances(
 
     sensors (n, 3) f32: the sides from which the surface is seen. own, other (k, 3) f32, sorted into cubes as in
     `count_around`. radii (r,): scales, ascending; the first at which the own cloud is a plane is taken, else the last.
-    reach: farthest that is looked for, m. least: points that a mean needs. Out: out (n, 2) f32, the distance and the
+    reach: of the search, m. least: points that a mean needs. Out: out (n, 2) f32, the distance and the
     level of detection at 95 %; nan where a cloud has too few points.
     """
     normal = np.zeros(3)

@@ -10,23 +10,24 @@ from app.slam.kernels.small import copy, cross
 CELLS, EDGE_M = 128, 0.5
 """Cells along each side of the square, and the length of a cell's edge."""
 COUNT, MEAN, LOWEST, HIGHEST = range(4)
-"""Of the heights (m, odometry's frame) that scans show in a cell. Mean and count are of points on the lowest lines."""
+"""Statistics of the heights (m, odometry's frame) in a cell. Count and mean are of points on the lowest lines only."""
 NOTHING = np.array([0.0, 0.0, np.inf, -np.inf], np.float32)
-"""Of a cell that no scan shows."""
+"""The statistics of a cell that no scan shows."""
 NONE, BESIDE, FLOOR, PLANE = range(4)
 """What a cell is: nothing, beside the floor, floor, or floor on its plane."""
 _HEAD_M = 0.5
-"""Points up to this height above the scanner show a wall too: what a near one has below it is low and looks flat."""
+"""Points up to this height above the scanner are used to detect walls: the part of a near wall below the scanner is low
+and looks flat."""
 _FLAT_M = 0.15
 """Heights within one cell of the floor differ by less."""
 _RISE_M = 0.1
 """Heights of neighbouring cells of the floor differ by less: a slope of 11 degrees, a low kerb."""
 _FOOT_M = 0.05
-"""At a wall, floor is nearer to the floor beside it than this."""
+"""At a wall, a floor cell differs in height from the floor beside it by less than this."""
 _LEAST_POINTS, _MOST_SCANS = 3, 50.0
-"""Points that a cell's height is believed from, and scans that it is averaged over at most."""
+"""Least number of points for a cell's height, and most scans that it is averaged over."""
 _LEAST_CELLS, _TRIALS, _JUDGES = 8, 200, 400
-"""Cells that make a floor, planes that are tried, and about the number of cells that they are tried on."""
+"""Least number of cells of a floor, number of planes that are tried, and about how many cells each is tried on."""
 
 
 @njit(cache=True, nogil=True)
@@ -49,9 +50,9 @@ def see(points, ring, last, R, p, corner, seen):
 
 @njit(cache=True, nogil=True)
 def carry(seen, found, known, by, full, now_seen, now_known):
-    """Carry what cells hold to the square around the next scan.
+    """Carry the contents of cells over to the square around the next scan.
 
-    Heights of cells that were found to be the floor are kept, and those that scans contradict are forgotten.
+    Heights of cells that were found to be floor are kept, and heights that scans contradict are forgotten.
 
     seen (2, CELLS, CELLS, 4) f32; found (CELLS, CELLS) f32 m, nan where there is no floor; known (CELLS, CELLS, 2) f32:
     m, and the number of scans that it is the mean of, 0 where it is not known; by (2,): cells to the next square;
@@ -79,11 +80,12 @@ def carry(seen, found, known, by, full, now_seen, now_known):
 
 @njit(cache=True, nogil=True)
 def find(seen, known, corner, p, sigma, cos_slope, heights, kinds, seeds):
-    """Find the floor: the lowest plane that most cells share, and from there on cell by cell.
+    """Find the floor: the lowest plane that most cells share, then extended cell by cell.
 
-    A cell is flat if its heights differ little, which a wall's do not. Of planes through three cells that are flat or
-    known, less steep than the slope, the one counts that most cells lie on and fewest below. Cells on it are floor,
-    and so are their neighbours at about the same height, and theirs. A cell beside the floor may be its edge.
+    A cell is flat if its heights differ little; the cell of a wall is not. Planes are tried through three cells that
+    are flat or known, if they are less steep than the limit. The plane with the most cells on it and the fewest below
+    is chosen. Cells on it are floor, and so are their neighbours at about the same height, and in turn the neighbours
+    of these. A cell beside the floor may be its edge.
 
     Arguments as `see` and `carry`; sigma m/m; cos_slope of the steepest plane. Out: heights (CELLS, CELLS) f32 m,
     nan where there is no floor; kinds (CELLS, CELLS) u8, NONE to PLANE; seeds (CELLS², 3) f64 m, from the LiDAR,
@@ -144,7 +146,7 @@ def find(seen, known, corner, p, sigma, cos_slope, heights, kinds, seeds):
 
 @njit(cache=True, nogil=True)
 def label(points, ring, last, R, p, corner, heights, kinds, sigma, labels):
-    """Label 1 the points on the floor, 2 those of them on the lowest lines in cells of the plane, 0 others.
+    """Label points: 1 on the floor, 2 on the floor, the lowest lines and a cell of the plane, 0 elsewhere.
 
     Arguments as `see` and `find`.
 
@@ -174,7 +176,7 @@ def _cell(point, R, p, corner):
 
 @njit(cache=True)
 def _both(seen, i, j):
-    """Count, mean, lowest and highest of the scans at hand, of both halves of `seen` together."""
+    """Count, mean, lowest and highest of both halves of `seen` together."""
     new, old = seen[0, i, j], seen[1, i, j]
     count = new[COUNT] + old[COUNT]
     mean = (new[COUNT] * new[MEAN] + old[COUNT] * old[MEAN]) / max(count, 1.0)
@@ -183,7 +185,7 @@ def _both(seen, i, j):
 
 @njit(cache=True)
 def _lowest_plane(cells, sigma, cos_slope):
-    """A point and the normal of the plane that most cells lie on and fewest below; zeros if there is none."""
+    """A point and the normal of the plane with the most cells on it and the fewest below; zeros if there is none."""
     best, chosen, plane = 0.5 * _LEAST_CELLS, np.zeros(3), np.zeros(3)
     if len(cells) < _LEAST_CELLS:
         return chosen, plane

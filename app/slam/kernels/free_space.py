@@ -1,7 +1,7 @@
 """Space that a scan saw through: its ranges by direction, and points of other scans looked up in them.
 
-Directions are bins of Lambert's equal-area map around +z, which covers all of them but -z in one square. A bin near +z
-is `size` rad wide on both sides.
+Directions are bins of Lambert's equal-area map around +z, which covers all directions except -z in one square. A bin
+near +z is `size` rad wide along both axes.
 """
 
 import math
@@ -14,7 +14,8 @@ from app.slam.kernels.clouds import PRIME_X, PRIME_Y, PRIME_Z
 NEAR, FAR = 0, 1
 """Layers of an image: the least and the greatest range in a bin, m; inf and 0 where nothing returned."""
 RING = 2
-"""Bins to each side in which nothing may stand before a place that is seen through: scan lines lie so far apart."""
+"""A place is seen through only if nothing is in front of it in this many bins to each side: scan lines lie so far apart.
+"""
 
 
 @njit(cache=True, inline="always")
@@ -46,7 +47,7 @@ def look(points, size, image):
 
 @njit(cache=True)
 def group(points, labels, edge, reach, table, cells, first, voxel):
-    """Put the points that are no ground and within `reach` m into voxels.
+    """Put the points that are not ground and lie within `reach` m into voxels.
 
     points (n, 3) f32 m; labels (n,) u8, not 0 = ground; edge m. Scratch: table (2^k,) i32. Out: cells (n, 3) i32 of
     the m voxels; first (n,) i32, a point of each; voxel (n,) i32 of each point, -1 = none. Returns m.
@@ -79,7 +80,7 @@ def vote(points, first, T, size, image, margin, slack, most_hits, through, hits)
     """Look places up in an image of another scan: whether it saw through each, or hit something there.
 
     points (n, 3) f32 m with first (m,) i32 of them; T (3, 4) f64, from their frame to that of the image; size rad;
-    image as of `look`. What is within margin m + slack of the range is at the place. Places with more than
+    image as of `look`. A return within margin m + slack of the range counts as at the place. Places with more than
     `most_hits` hits are settled. In and out: through and hits (m,) i32, counts of images.
     """
     wide = image.shape[0]

@@ -8,7 +8,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def steep_seeds(points, ring, lines, down, cos_alpha, labels):
-    """Mark the seeds of the paper: label 2 for points on the outermost `lines` present, within the angle alpha of down.
+    """Mark the paper's seeds: label 2 for points on the outermost `lines` present and within the angle alpha of down.
 
     points (n, 3) f32 m, LiDAR frame; ring (n,) u16, line of each point, 0 the outermost; down (3,) unit. Out: labels
     (n,) u8. Returns the number of seeds, and of points on any line within alpha of down.

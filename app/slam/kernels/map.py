@@ -33,16 +33,16 @@ def _begin(point, x, y, z, now, eye):
 
 
 MOST_HITS = 8
-"""Hits that count. A point that went on following the scans would let the map drift with them."""
+"""Number of hits that are averaged. If a point kept following the scans, the map would drift with them."""
 
 
 @njit(cache=True, nogil=True)
 def insert(points, eye, voxel, spacing, now, old, table, cells, counts, store, used, refused):
     """Add points that are not within `spacing` of a point in their own voxel. Returns used.
 
-    A point within `spacing` is another hit of the nearest there, which becomes the mean of its first MOST_HITS. So
-    noise averages out. If the nearest was last seen before `old`, the point takes its place: a mean of both would
-    mix the surface as it is seen now with where odometry put it then.
+    A point within `spacing` is another hit of the nearest map point there, which becomes the mean of its first
+    MOST_HITS hits. So noise averages out. If the nearest was last seen before `old`, the new point takes its place: a
+    mean of both would mix the surface as it is seen now with where odometry put it then.
 
     points (n, 3) f32 m, odom; eye (3,) m, the sensor; voxel, spacing m; now, old: drift, m². In and out: table (2^k,)
     i32, slot by hash or -1; cells (v, 3) i32, voxel indices; counts (v,) u8; store (v, m, 8) f32: x, y, z in m, hits,
@@ -126,7 +126,7 @@ def evict(center, radius, voxel, table, cells, counts, store, used):
 
 
 MOST = 40
-"""Most neighbours of a patch; one that is still uncertain with them is not used."""
+"""Most neighbours of a patch; a patch that is still uncertain with this many is not used."""
 BINS = 64
 """Steps of squared distance by which neighbours are ranked. Exact sorting takes three times as long."""
 SURE_TILT = math.radians(1.5)
@@ -135,16 +135,16 @@ PLANE_FREEDOM = 3
 """Degrees of freedom of a plane. The squared distances of k points from it are averaged over k - 3, since a
 few points lie flat by chance."""
 LEAST_SCATTER = 1.5
-"""Least scatter assumed of a plane's points, in standard deviations of a map point: one scan's points share errors, and
-the first scan has no other point beside them."""
+"""Least scatter assumed for a plane's points, in standard deviations of a map point: points of one scan share errors,
+and after the first scan there are no others."""
 BEHIND = 0.15
 """Least cosine between a plane's normal and the direction in which a point was seen from behind. A thin wall has two
-faces some centimetres apart, and a scan of one must not be fitted to the other. Closer to edge-on, the side is not
-sure."""
+faces some centimetres apart, and a scan of one must not be fitted to the other. Closer to edge-on, the side is
+uncertain."""
 SHARED = 4.0
 """Weight of a plane's own variance: points on the same patch share its error, which does not average out."""
 OLD = 4.0
-"""Weight of an old plane's variance: odometry has drifted since, and the pose is to return to it smoothly."""
+"""Weight of an old plane's variance: odometry has drifted since, and the pose should return to it smoothly."""
 
 
 @njit(cache=True, inline="always")
@@ -155,7 +155,7 @@ def _outside(u, cell):
 
 @njit(cache=True, error_model="numpy")
 def _nearest(x, y, z, voxel, reach2, old, table, cells, counts, places, room, spots, bins, begin, order):
-    """Map points within reach of (x, y, z) m, ranked by distance up to the width of a bin, the present ones first.
+    """Map points within reach of (x, y, z) m, ranked by distance to within a bin's width, those not old first.
 
     reach2 m²; places (v * room, 8): the store, flat; old: drift, before which a point was last seen if it is old.
     Returns the numbers of present points and of all. Out: order (m,) i32, their rows in `places`, ranked. Scratch:
@@ -291,14 +291,14 @@ def planes(
     begin, end, queries, eye, voxel, reach, first, flat, tilts, noise, old, table, cells, counts, store,
     normals, centers, variances, deviations,
 ):  # fmt: skip
-    """Planes through the nearest map points of queries [begin, end), one for each of the falling `tilts` (k,) rad.
+    """Planes through the nearest map points of queries [begin, end), one for each of `tilts` (k,) rad, descending.
 
     The `first` nearest points within `reach` m are tried first. The normal of a plane through k points of scatter s is
     uncertain by s / sqrt(k l2) rad. While that exceeds the tilt (neighbours on one scan line do not determine the
     surface across it), the patch is widened to twice as many points, up to MOST. The plane is accepted once it is
     certain enough, every neighbour lies within `flat` m of it, and none was seen from its other side.
 
-    Points last seen before drift was `old` m² are used only where the present ones give no plane, and never with these.
+    Points last seen before drift was `old` m² are used only if newer ones give no plane, and never together with these.
 
     queries (n, 3) f64 m, odom; eye (3,) m, the sensor; noise: of a point, m; the map as in `insert`. Out: normals
     (k, n, 3) unit, centers (k, n, 3) m, variances (k, n): of a point's distance from its plane in m², negative where

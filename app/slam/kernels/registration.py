@@ -6,14 +6,14 @@ import numpy as np
 from numba import njit
 
 REPEATED = 2.0
-"""How many times the variance of a distance counts: errors of a calibration and of a patch of the map repeat from
-frame to frame, so they do not average out over time."""
+"""Factor on the variance of a distance: errors of the calibration and of a map patch repeat from frame to frame, so
+they do not average out over time."""
 EDGE_ON = 0.15
 """Least cosine between a beam and the normal of its plane. Points of one scan line at different depths lie on the cone
 that the line sweeps. That looks like a surface seen edge-on, and it turns with the scanner."""
 RESIDUAL_HUBER = 2.0
-"""Standard deviations beyond which a residual has constant influence (Huber 1964). Without that, one point of 400 on
-a wrong plane could move the pose by millimetres."""
+"""Standard deviations beyond which a residual has constant influence (Huber 1964). Otherwise, one of 400 points on a
+wrong plane could move the pose by millimetres."""
 
 
 @njit(cache=True)
@@ -53,8 +53,8 @@ def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, devi
     """Accumulate H^T W H and H^T W z of eq. 5-6 over all points with a plane.
 
     A normal has errors of its own. Their squares would count as information, mostly along a corridor, where there is
-    little other, and would pull each point towards the middle of its patch. What they add on average is subtracted
-    (Fuller 1987, "Measurement Error Models"), so H may have negative eigenvalues.
+    little real information, and would pull each point towards the middle of its patch. Their average contribution is
+    subtracted (Fuller 1987, "Measurement Error Models"), so H may have negative eigenvalues.
 
     Columns: rotation (right perturbation) and position. points (n, 3) f32 m, LiDAR frame; R, p: pose of the IMU in
     odom; R_il, p_il: pose of the LiDAR in the IMU frame; normals, centers (n, 3), variances (n,) m², deviations

@@ -24,7 +24,7 @@ def cross(a, b, out):
 def across(x, y, z):
     """Two unit vectors across a unit vector, a and b = (x, y, z) x a: ax, ay, az, bx, by, bz.
 
-    They are smooth in it except where |x| crosses 0.8.
+    They depend smoothly on it, except where |x| crosses 0.8.
     """
     if abs(x) < 0.8:  # its cross product with an axis well across it
         ax, ay, az = 0.0, z, -y
@@ -53,7 +53,7 @@ def rotation(wx, wy, wz, out):
 def quaternions(R, out):
     """Rotations R (n, 3, 3) f64 to out (n, 4) f64: x, y, z, w, with w >= 0.
 
-    Shepperd's method: the largest one is divided by, so no precision is lost.
+    Shepperd's method: it divides by the largest component, so no precision is lost.
     """
     row = np.empty(4)
     for n in range(len(R)):

@@ -6,12 +6,12 @@ import numpy as np
 from numba import njit
 
 LAYERS = 64
-"""Of a column; higher ones count as lower ones again."""
+"""Number of layers of a column; higher layers wrap around to the lowest."""
 
 
 @njit(cache=True)
 def columns(points, level, upright, yaw, position, cell, bare, tallest, plan):
-    """Raster of what stands upright, of points turned by yaw (rad) about the vertical and then moved.
+    """Raster of upright structure, of points turned by yaw (rad) about the vertical and then moved.
 
     points (n, 3) f64 m; level, upright (n,) bool: ground, and neither ground nor ceiling; position (3,) m; cell: edge
     of cells and layers, m. Out: plan (k, k) f32, which wraps around; the origin is in the first cell. Where something

@@ -1,8 +1,8 @@
 """The loop back end: keyframes in, loops and corrected poses out. Synchronous and deterministic.
 
-There are two layers: the loops that were found are history (`search`); the user's edits override them and belong to the
-present. The graph is a function of both, so it does not matter when an edit was made, and undoing it is the same as
-never having made it.
+There are two layers. The loops that were found are the history (`search`); the user's edits override them and belong to
+the present. The graph is a function of both, so it does not matter when an edit was made, and undoing an edit is the
+same as never having made it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -37,18 +37,18 @@ class LoopBackend:
     def __init__(self) -> None:
         self.edits = Edits()
         self._search = Search()
-        self._edited = self._search.graph  # with the edits; the search's own without any
+        self._edited = self._search.graph  # with the edits; without any, the search's own graph
         self._made: dict[tuple[Add, int], LoopEdge] = {}  # loops by hand, by the last keyframe that they depend on
         self._state: tuple[F64, dict[Pair, LoopEdge]] | None = None  # poses and loops; None: not up to date
         self._notices: list[str] = []
-        self._said: set[str] = set()  # all notices ever
+        self._said: set[str] = set()  # all notices given so far
 
     def __len__(self) -> int:
         return len(self._search)
 
     @property
     def known(self) -> int:
-        """Keyframes of the history, including those beyond the present one."""
+        """Number of keyframes of the history, including those beyond the present one."""
         return self._search.known
 
     @property
@@ -65,7 +65,7 @@ class LoopBackend:
         self._made = {key: edge for key, edge in self._made.items() if key[1] < keyframe.index}
         self._search.add(keyframe, params, priors)
         if len(self) < 2:
-            self._edited = Graph(self._odometry[0], self._search.start.window)  # from another first keyframe
+            self._edited = Graph(self._odometry[0], self._search.start.window)  # the first keyframe is another one
 
     def finish(self) -> None:
         """The session ends here: look for loops of the last keyframes too. `add` and `go_to` take that back."""
@@ -116,16 +116,16 @@ class LoopBackend:
 
     @property
     def edges(self) -> tuple[LoopEdge, ...]:
-        """All candidates as they count now, in the order of their keyframes."""
+        """All candidates with their present verdicts, in the order of their keyframes."""
         return tuple(self.by_pair.values())
 
     @property
     def by_pair(self) -> Mapping[Pair, LoopEdge]:
-        """The same, by pair. It is not changed later."""
+        """The same, by pair. This mapping is never changed later."""
         return self._solved()[1]
 
     def take_notices(self) -> tuple[str, ...]:
-        """What went wrong since the last call, in sentences. Each is reported once."""
+        """What went wrong since the last call, in sentences. Each sentence is reported once."""
         notices, self._notices = self._notices, []
         return tuple(notices)
 
@@ -152,7 +152,7 @@ class LoopBackend:
         check(edit)
         if isinstance(edit, Add):
             there = edit.newer < len(self)
-            if there and edit.guess is None:  # as it is now, so that it is the same when repeated
+            if there and edit.guess is None:  # the present guess, so that repeating the edit gives the same
                 edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
             self._check_made(edit)
         else:
@@ -190,7 +190,7 @@ class LoopBackend:
         return Preview(poses, residuals(factors, poses))
 
     def _check_made(self, edit: LoopEdit) -> None:
-        """Raises HemislamError if it is a loop by hand whose registration found nothing in common."""
+        """Raises HemislamError if the edit adds a loop by hand whose registration found nothing in common."""
         if isinstance(edit, Add) and edit.register and edit.newer < len(self) and not self._make(edit).evidence.overlap:
             raise HemislamError(
                 f"The surroundings of keyframes {edit.older} and {edit.newer} have nothing in common from there;"
@@ -198,7 +198,7 @@ class LoopBackend:
             )
 
     def _make(self, edit: Add) -> LoopEdge:
-        """The loop by hand of keyframes that exist, by their surroundings as far as there are any."""
+        """The loop by hand between existing keyframes, registered by as much of their surroundings as there is."""
         detector = self._search.detector
         key = edit, min(edit.newer + detector.ahead, len(self) - 1)
         if key not in self._made:
@@ -229,7 +229,7 @@ class LoopBackend:
         return apply_edits(self._search.found, edits, made)
 
     def _solved(self) -> tuple[F64, dict[Pair, LoopEdge]]:
-        """(k, 4, 4) T_map_imu by the incremental solver, and the loops as they count."""
+        """(k, 4, 4) T_map_imu by the incremental solver, and the loops with their present verdicts."""
         if self._state is None:
             edges = self._with_edits(self.edits.done)
             graph = self._edited if self.edits.done else self._search.graph
@@ -240,7 +240,7 @@ class LoopBackend:
         return self._state
 
     def _factors(self, edges: Mapping[Pair, LoopEdge]) -> list[Closing]:
-        """All of the graph."""
+        """All factors of the graph."""
         return self._edited.factors(self._search.measured, edges, self._odometry)
 
     def _say(self, notice: str) -> None:

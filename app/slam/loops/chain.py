@@ -44,13 +44,13 @@ class Chain:
         return lie.inverse(poses[first]) @ poses[second], (covariance + covariance.T) / 2
 
     def bent(self, ends: I64, T_ends: F64, stop: int) -> F64:
-        """The most likely poses from ends[0] to before `stop`, if those of the ends are known.
+        """The most likely poses from ends[0] to before `stop`, given the poses at the ends.
 
         Args:
-            ends: (m,), rising. T_ends: (m, 4, 4) of them.
+            ends: (m,), rising. T_ends: (m, 4, 4), their poses.
 
         Returns:
-            (stop - ends[0], 4, 4); after the last end as odometry goes on.
+            (stop - ends[0], 4, 4); after the last end, odometry continues.
         """
         first, last = int(ends[0]), int(ends[-1])
         poses = self._poses.view()
@@ -71,10 +71,10 @@ class Chain:
         return out
 
     def _steps(self, before: int, ends: I64) -> tuple[F64, F64]:
-        """Of the poses after `before`, one for each of `ends`, as seen from the end that is named for it.
+        """The poses after `before`, each relative to its end in `ends`.
 
         Returns:
-            (n, 4, 4) poses, and (n, 6, 6) covariances of the steps to them, there.
+            (n, 4, 4) poses, and (n, 6, 6) covariances of the steps to them, at the ends.
         """
         own = slice(before + 1, before + 1 + len(ends))
         poses = self._poses.view()

@@ -1,7 +1,7 @@
 """From a keyframe to candidates with evidence: place recognition and registration.
 
-A keyframe is looked at once all keyframes of its submap have come and odometry between them can be judged, so that its
-surroundings are as dense as those of the older ones it is compared with.
+A keyframe is searched once all keyframes of its submap have come and odometry between them can be judged. Then its
+surroundings are as dense as those of the older keyframes that it is compared with.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,13 +29,13 @@ NEAR_M = 3.0
 FAR_M = 40.0
 """Reach of submaps where little stands upright nearby, as on a plaza."""
 WIDER = 2.0
-"""Odometry that slipped is farther off than the model of drift allows, so it is searched this many times as far."""
+"""Odometry that slipped is farther off than the drift model allows, so the search reaches this many times as far."""
 KEPT_PREPARED = 8
 """Submaps that stay in memory, ready for registration: the newer one, and older ones, which are often met again."""
 KEPT_SUBMAPS = 1
-"""Submaps that stay in memory otherwise: the one just described is needed again."""
+"""Other submaps that stay in memory: the one just described is needed again."""
 KEPT_PIECES = 2 * slips.REACH
-"""Clouds on one side of a step: what was after one is before another, `slips.REACH` steps later."""
+"""Clouds on one side of a step that stay in memory: `slips.REACH` steps later, they are on the other side."""
 _NUMBERS = np.empty(0, np.float32)
 _NO_POINTS = Cloud(_NUMBERS, np.empty(0, np.uint8), _NUMBERS, np.empty(0, np.uint16), np.empty(0, np.int32))
 
@@ -45,7 +45,7 @@ class Sighting:
     """A place that looks like an older one.
 
     Attributes:
-        older, newer: keyframes. distance: of their contexts at the best column shift.
+        older, newer: keyframes. distance: between their contexts at the best column shift.
     """
 
     older: KeyframeId
@@ -54,14 +54,14 @@ class Sighting:
 
 
 class Detector:
-    """Describes and compares the first `len` keyframes of those it was given.
+    """Describes and compares keyframes: the first `len` of those it was given.
 
     Args:
         params: only those that act on restart are read here.
 
     Attributes:
-        half: keyframes on either side of one that make its submap with it. ahead: those that must follow it before its
-            surroundings are known: its submap, and whether odometry slipped there.
+        half: number of keyframes on either side of a keyframe that form its submap with it. ahead: number that must
+            follow before its surroundings are known: its submap, and whether odometry slipped there.
     """
 
     def __init__(self, params: LoopsParams) -> None:
@@ -84,11 +84,11 @@ class Detector:
 
     @property
     def described(self) -> int:
-        """How many keyframes, from the first on, can be looked for."""
+        """How many keyframes, counted from the first, can be searched for loops."""
         return len(self._contexts)
 
     def head(self, index: int) -> Keyframe:
-        """Any keyframe that was taken, also beyond the present one, without its points."""
+        """A keyframe without its points; it may lie beyond the present one."""
         return self._heads[index]
 
     @property
@@ -98,7 +98,7 @@ class Detector:
 
     @property
     def resumed(self) -> Mask:
-        """(k,) which are the first after a pause."""
+        """(k,) whether each keyframe is the first after a pause."""
         return self._resumed[: len(self)]
 
     @property
@@ -126,11 +126,11 @@ class Detector:
         self._keys = [context.ring_key for context in contexts]
 
     def go_on(self) -> None:
-        """To the next keyframe that was taken."""
+        """Go to the next keyframe that was taken."""
         self._count += 1
 
     def learn(self, contexts: Iterable[ScanContext]) -> None:
-        """Take the contexts of the next keyframes that have none."""
+        """Store the contexts of the next keyframes that have none."""
         for context in contexts:
             self._contexts.append(context)
             self._keys.append(context.ring_key)
@@ -161,7 +161,7 @@ class Detector:
         return self._contexts[index] if index < self.described else self.describe(index)
 
     def submap(self, index: int, *, wide: bool = False) -> Prepared:
-        """From the keyframes around one, up to the nearest slip of odometry on either side."""
+        """The submap from the keyframes around this one, up to the nearest slip of odometry on either side."""
         before = range(index, self._first(index, self.half), -1)
         after = range(index + 1, self.last(index, self.half) + 1)
         first = next((k for k in before if self.slip(k) is not None), before.stop)
@@ -171,7 +171,7 @@ class Detector:
     def slip(self, index: int) -> Slip | None:
         """How odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`.
 
-        Not across a pause, where it is a guess.
+        None across a pause, where odometry is a guess.
         """
         if self._resumed[index]:
             return None
@@ -186,7 +186,7 @@ class Detector:
         return lie.transform(self.poses[index, :3, :3], np.zeros(3))
 
     def look(self, newer: int, expectation: Expectation, params: LoopsParams) -> list[Sighting]:
-        """Older places that look like this one, the most similar first, each well apart from the others."""
+        """Older places that look like this keyframe's, the most similar first, each well apart from the others."""
         p = params
         candidates = self._eligible(newer, expectation, p)
         if not len(candidates):
@@ -203,12 +203,12 @@ class Detector:
         return chosen[: p.verified]
 
     def guess(self, older: int, newer: int, poses: F64) -> F64:
-        """(4, 4) of the level frames, newer in older, by poses T_map_imu of all keyframes."""
+        """(4, 4) T_older_newer of the level frames, by poses T_map_imu of all keyframes."""
         T_older_newer = lie.inverse(poses[older]) @ poses[newer]
         return np.asarray(self.T_level_imu(older) @ T_older_newer @ lie.inverse(self.T_level_imu(newer)))
 
     def both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
-        """Their submaps, which reach farther if one place is bare; the newer one is made first: it is needed again."""
+        """The submaps of both. They reach farther if one place is bare. The newer is made first: it is needed again."""
         source = self.submap(newer)
         target = self.submap(older)
         if source.bare or target.bare:
@@ -217,10 +217,10 @@ class Detector:
         return target, source
 
     def detail(self, older: int, newer: int, poses: F64, T_older_newer: F64 | None) -> LoopDetail:
-        """Both places, and how they fit at a loop's measurement; None: as the graph has them.
+        """Both places, and how well they fit.
 
         Args:
-            poses: (k, 4, 4) T_map_imu.
+            poses: (k, 4, 4) T_map_imu. T_older_newer: a loop's measurement; None: by the graph's poses.
         """
         guess = T = self.guess(older, newer, poses)
         if T_older_newer is not None:
@@ -260,17 +260,17 @@ class Detector:
         return Sighting(KeyframeId(0, older), KeyframeId(0, newer), distance)
 
     def last(self, index: int, ahead: int) -> int:
-        """The last of the next few keyframes that no pause separates from one."""
+        """The last keyframe, at most `ahead` after this one, before any pause."""
         end = min(len(self), index + ahead + 1)
         paused = np.flatnonzero(self._resumed[index + 1 : end])
         return index + int(paused[0]) if len(paused) else end - 1
 
     def _first(self, index: int, back: int) -> int:
-        """The first of the few keyframes before one that no pause separates from it."""
+        """The first keyframe, at most `back` before this one, after any pause."""
         return max(self._begin(index), index - back)
 
     def _begin(self, index: int) -> int:
-        """The first keyframe after the last pause before one, or of all."""
+        """The first keyframe after the last pause before this one; without a pause, the first of all."""
         paused = np.flatnonzero(self._resumed[: index + 1])
         return int(paused[-1]) if len(paused) else 0
 

@@ -1,7 +1,7 @@
 """How far odometry may have drifted between two keyframes, and whether measured loops agree with it.
 
 The filter's covariance does not show this: it takes the map as exact, so it stays at millimetres however long the
-trajectory. Drift grows with the distance. Model: position drifts by a share of the distance, height by a smaller one,
+trajectory. Drift grows with the distance. Model: position drifts by a share of the distance, height by a smaller share,
 heading by an angle per metre, all constant (the worst case, as nothing averages out) and independent. Gravity fixes
 roll and pitch, and thereby the height. The distance between two keyframes is the shortest one through the graph:
 accepted loops are short cuts.
@@ -23,10 +23,10 @@ from app.slam.types import F64, Mask
 POSITION_M, ROTATION = 0.05, np.radians(0.5)
 """Standard deviations at distance zero, of registration and of submaps (m; rad about each axis)."""
 PAUSE_M, PAUSE_TURN = 100.0, np.radians(7.5)
-"""A pause counts as so many metres of odometry, and adds an error of the heading: a recording is expected to go on
-about where it stopped, and facing about the same way. Elsewhere, places that look alike could not be told apart."""
+"""A pause counts as this many metres of odometry, and adds a heading error: a recording is expected to resume about
+where it stopped, facing about the same way. Otherwise, places that look alike could not be told apart."""
 PAUSE_TILT = np.radians(1.0)
-"""Error of roll and pitch by a pause: after so short a time in motion, the filter hardly knows gravity better."""
+"""Error of roll and pitch after a pause: after such a short time in motion, the filter hardly knows gravity better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Drift:
 
 
 class Deviation(NamedTuple):
-    """Of a measured pose from what the graph expects.
+    """How far a measured pose deviates from what the graph expects.
 
     Attributes:
         sigmas: of the whole pose, height_sigmas: of the height alone, in standard deviations. height: m, too high if
@@ -59,13 +59,13 @@ class Deviation(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What the graph expects of every keyframe as seen from one, the root.
+    """Where the graph expects every keyframe relative to one of them, the root.
 
     Attributes:
         root: index. poses: (k, 4, 4) T_map_imu. way: (k,) m, shortest through the graph.
-        lever: (k, 3) m^2, integral of the lever arm along the way: what a constant rate of heading
-            drift, rad/m, is multiplied by (crossed with z) to give the error of position.
-        pauses: (k,) on the way. arm: (k, 3) m, sum of the ways from them to the root, as the crow flies.
+        lever: (k, 3) m^2, integral of the lever arm along the way. Crossed with z and multiplied by a
+            constant rate of heading drift, rad/m, it gives the error of position.
+        pauses: (k,) number on the way. arm: (k, 3) m, sum of the straight lines from them to the root.
     """
 
     root: int
@@ -99,7 +99,7 @@ class Expectation:
         return np.asarray(np.sqrt((self.drift.translation * self.way) ** 2 + sideways**2 + swung**2 + POSITION_M**2))
 
     def deviation(self, other: int, T_other_root: F64) -> Deviation:
-        """Of a measured (4, 4) pose of the root, seen from `other`."""
+        """The deviation of a measured (4, 4) pose of the root, as seen from `other`."""
         R = self.poses[other, :3, :3]
         expected = lie.inverse(self.poses[other]) @ self.poses[self.root]
         turned = R @ lie.log(T_other_root[:3, :3] @ expected[:3, :3].T)
@@ -131,11 +131,11 @@ def expect(
     steps += PAUSE_M * resumed[1:] + np.broadcast_to(astray, count)[1:] / drift.translation
     pairs = np.array([loop.pair for loop in loops], dtype=np.int64).reshape(-1, 2)
     measured = np.array([loop.T_older_newer for loop in loops]).reshape(-1, 4, 4)
-    left = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]  # what the graph leaves of each loop
+    left = lie.inverse(poses[pairs[:, 0]] @ measured) @ poses[pairs[:, 1]]  # error of each loop in the graph
     missed = np.maximum(np.linalg.norm(left[:, :3, 3], axis=1) - POSITION_M, 0.0) / drift.translation
     turned = np.maximum(np.linalg.norm(lie.log(left[:, :3, :3]), axis=1) - ROTATION, 0.0) / drift.rotation
     short = np.maximum(missed, turned)
-    neighbours = pairs[:, 1] - pairs[:, 0] == 1  # such a loop stands in for the step, since two edges would add up
+    neighbours = pairs[:, 1] - pairs[:, 0] == 1  # such a loop replaces the odometry step, since two edges would add up
     unpaused = np.zeros(count, np.bool_)
     unpaused[pairs[neighbours, 1]] = short[neighbours] < steps[pairs[neighbours, 0]]
     np.minimum.at(steps, pairs[neighbours, 0], short[neighbours])

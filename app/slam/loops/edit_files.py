@@ -15,7 +15,7 @@ A loop is named by its older and its newer keyframe: an index, or `session/index
 `guess` is T_older_newer of the IMU frames; without it, the search starts from where odometry places it. `register` is
 true by default. `solve: at once` takes the poses from all factors at once
 (Levenberg-Marquardt) instead of one after the other. `override` counts or leaves out a satellite fix,
-by its number, or a control point: `point P1`.
+by its number, or a control point by its name: `point P1`.
 """
 
 import re
@@ -74,7 +74,7 @@ def entries_of(edits: Iterable[LoopEdit]) -> list[dict[str, Any]]:
 
 
 def edits_of(entries: object, source: str = "the list of edits") -> tuple[LoopEdit, ...]:
-    """The edits that `entries_of` made these entries of; none of None.
+    """The edits from which `entries_of` made these entries; no edits for None.
 
     Raises:
         HemislamError: naming `source` and the entry that cannot be used, counted from 1.

@@ -20,7 +20,7 @@ from app.slam.loops.types import LoopEdge, Origin, Pair, Verdict
 class _Edit:
     @property
     def pair(self) -> Pair | None:
-        """The loop that it edits; None: none, but the graph or a fix."""
+        """The loop that it edits; None if it concerns the graph or a fix instead."""
         return None
 
 
@@ -69,13 +69,13 @@ class Add(_PairEdit):
 class Solve(_Edit):
     """Take the poses from all factors solved at once (Levenberg-Marquardt).
 
-    They differ from the incremental ones where those only came near the optimum, and with a window.
+    They differ from the incremental poses if these only came near the optimum, or if the solver has a window.
     """
 
 
 @dataclass(frozen=True, slots=True)
 class Override(_Edit):
-    """Count or leave out what georeferences the map, whatever its residual. It changes nothing of the loops.
+    """Count or leave out a fix or control point that georeferences the map, whatever its residual. Loops stay the same.
 
     Attributes:
         what: "fix 12" or "point P1", as the table of residuals names them.
@@ -108,7 +108,7 @@ class Edits:
         return Edits((*self.done, self.undone[-1]), self.undone[:-1])
 
     def among(self, count: int) -> "Edits":
-        """Those that name no later keyframe than the first `count`."""
+        """The edits that name only the first `count` keyframes."""
 
         def kept(edits: tuple[LoopEdit, ...]) -> tuple[LoopEdit, ...]:
             return tuple(edit for edit in edits if edit.pair is None or edit.pair[1].index < count)
@@ -174,7 +174,7 @@ _FOUND: Final = {
 
 
 def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
-    edge = replace(edge, represented_by=None, repeats=None)  # loops that the user edited are in the graph themselves
+    edge = replace(edge, represented_by=None, repeats=None)  # a loop that the user edited enters the graph itself
     if isinstance(edit, SetWeight):
         return replace(edge, weight=edit.weight)
     if isinstance(edit, Add | Solve | Override):  # one that waits; those that are for no loop
@@ -187,7 +187,7 @@ def _edited(edge: LoopEdge, edit: LoopEdit) -> LoopEdge:
 
 
 def _standing(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:
-    """The same; in the graph itself if the one that was there for it, or that it repeats, no longer is.
+    """The same loop. It enters the graph itself if the loop that represents it, or that it repeats, is no longer there.
 
     No loop repeats one that was added by hand: that is the user's decision and must not be outvoted.
     """
@@ -201,7 +201,7 @@ def _standing(edge: LoopEdge, edges: Mapping[Pair, LoopEdge]) -> LoopEdge:
 
 
 def _counting(pair: Pair | None, edges: Mapping[Pair, LoopEdge]) -> Pair | None:
-    """The loop that counts where this one was to stand for others: it may have one that stands for it by now."""
+    """The loop that counts in place of `pair`: by now, another loop may represent it. None if there is none."""
     edge = None if pair is None else edges.get(pair)
     if edge is None or edge.verdict is not Verdict.ACCEPTED:
         return None

@@ -1,4 +1,4 @@
-"""Factors of the pose graph: what was measured between two keyframes, or of one."""
+"""Factors of the pose graph: measurements between two keyframes, or of one keyframe."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ class Factor:
 
     Attributes:
         robust: whether a large error pulls less than its square, as a loop's should.
-        loop: the loop it stands for, if that is not between these two; None: it is.
+        loop: the loop that it stands for, if that loop ties two other keyframes; else None.
     """
 
     first: KeyframeId
@@ -59,9 +59,9 @@ class PositionPrior:
 
 
 Closing = Factor | PositionPrior
-"""What ties poses that are in the graph already."""
+"""A factor on poses that are already in the graph."""
 Step = Factor | tuple[Closing, ...]
-"""One change of a graph: odometry to the next pose, or what ties poses that it has."""
+"""One change of a graph: odometry to the next pose, or factors on poses that the graph has."""
 
 
 STILL_M, STILL_RAD = 0.001, np.radians(0.02)
@@ -69,16 +69,16 @@ STILL_M, STILL_RAD = 0.001, np.radians(0.02)
 LOST_M, LOST_RAD = 10.0, 1.0
 """Standard deviations of a step across a pause, along each axis and of the heading."""
 EVEN_M = 1.0
-"""m over which drift keeps its direction: over a distance L it grows to drift * sqrt(L * EVEN_M)."""
+"""m over which drift keeps its direction: over a distance L, drift grows to drift * sqrt(L * EVEN_M)."""
 
 
 def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift) -> Factor:
-    """From one keyframe to the next.
+    """Odometry from one keyframe to the next.
 
-    The filter gives the covariance of each pose in its map, which it takes as exact, not that of the step between them.
-    So the covariances of both poses are added, as if they were independent (an upper bound), and drift is added as a
-    random walk: constant over `EVEN_M`, independent beyond. A step across a pause is a guess. One that a scan
-    contradicted may be off by metres.
+    The filter gives the covariance of each pose in its map, which it takes as exact, but not that of the step between
+    two poses. So the covariances of both poses are added, as if they were independent (an upper bound), and drift is
+    added as a random walk: constant over `EVEN_M`, independent beyond. A step across a pause is a guess. A step that a
+    scan contradicted may be off by metres.
     """
     T = lie.inverse(before.T_odom_imu) @ after.T_odom_imu
     walked = float(np.linalg.norm(T[:3, 3]))
@@ -86,7 +86,7 @@ def odometry_factor(second: int, before: Keyframe, after: Keyframe, drift: Drift
     first = turn @ _own_axes(before) @ turn.T
     even = walked * EVEN_M
     covariance = first + _own_axes(after)
-    up = after.T_odom_imu[2, :3]  # gravity fixes the others
+    up = after.T_odom_imu[2, :3]  # gravity fixes rotation about the other axes
     covariance[:3, :3] += STILL_RAD**2 * np.eye(3) + drift.rotation**2 * even * np.outer(up, up)
     covariance[3:, 3:] += (STILL_M**2 + drift.translation**2 * even) * np.eye(3)
     covariance[3:, 3:] += (drift.height**2 - drift.translation**2) * even * np.outer(up, up)
@@ -104,7 +104,7 @@ def loosened(step: Factor, slip: F64, R_odom_imu: F64) -> Factor:
 
 
 def _own_axes(head: Keyframe) -> F64:
-    """(6, 6) covariance with the position's error in the IMU's axes, as the rotation's is; zero if it is no number."""
+    """(6, 6) covariance with errors of rotation and position in the IMU's axes; zero if it is not finite."""
     turn = np.eye(6)
     turn[3:, 3:] = head.T_odom_imu[:3, :3].T
     out = turn @ head.covariance @ turn.T
@@ -117,8 +117,8 @@ def loop_factors(
     """The factors of the loops that count.
 
     Args:
-        by_pair: all loops, including those that others repeat. T_odom_imu: (k, 4, 4). window: of the solver. With one,
-            each factor is between its own keyframes, as those of the loop that it repeats may have left the window.
+        by_pair: all loops, including those that others repeat. T_odom_imu: (k, 4, 4). window: of the solver. If there
+            is one, each factor ties its own keyframes, since those of a loop that it repeats may have left the window.
     """
     factors = []
     for edge in edges:
@@ -132,7 +132,7 @@ def loop_factors(
 
 
 def residuals(graph: Iterable[Closing], poses: F64) -> tuple[FactorResidual, ...]:
-    """Of every factor between two keyframes, by poses (k, 4, 4)."""
+    """The residual of every factor between two keyframes, by poses (k, 4, 4)."""
     factors = [factor for factor in graph if isinstance(factor, Factor)]
     if not factors:
         return ()

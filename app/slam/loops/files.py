@@ -83,7 +83,7 @@ def _certainty(edge: LoopEdge) -> tuple[float, ...]:
 
 
 def loops_csv(edges: tuple[LoopEdge, ...], stamps_ns: I64) -> str:
-    """One line a candidate; the pose is T_older_newer of the IMU frames, numbers that were not measured are empty.
+    """One line per candidate; the pose is T_older_newer of the IMU frames, and numbers not measured are empty.
 
     Args:
         stamps_ns: (k,) of keyframes.

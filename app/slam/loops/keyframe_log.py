@@ -40,7 +40,7 @@ class KeyframeLog(Log[KeyframeEntry]):
         return min(len(self.store), len(self))
 
     def holds(self, keyframe: Keyframe) -> bool:
-        """Whether the keyframe of this index was the same frame."""
+        """Whether the keyframe at this index is the same frame."""
         return keyframe.index < len(self) and self[keyframe.index].frame == keyframe.frame
 
     def until(self, frame: int) -> int:

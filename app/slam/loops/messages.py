@@ -1,8 +1,8 @@
-"""What a loop back end is asked and what it answers, as frozen values that also pass between processes.
+"""Requests to a loop back end and its replies, as frozen values that also pass between processes.
 
 A back end follows a log of keyframes: `AddKeyframe` sends the next one that it lacks. Everything else is a question
-about a `Target`, so an answer depends only on the keyframes and the question, not on what was asked before. Each
-request has one reply, in order. What cannot be done is answered by a `Failure`, and changes nothing.
+about a `Target`, so an answer depends only on the keyframes and the question, not on earlier questions. Each request
+has one reply, in order. A request that cannot be met is answered by a `Failure`, and changes nothing.
 """
 
 from dataclasses import dataclass, field
@@ -48,9 +48,8 @@ class AskState:
 
 @dataclass(frozen=True, slots=True)
 class ApplyEdit:
-    """Add an edit to those of the target. One for a pair that does not exist yet waits for it. Answered by `LoopState`.
-
-    The reply holds the edit as it must be repeated: with the guess that was used.
+    """Add an edit to those of the target. An edit of a pair that does not exist yet waits for it. Answered by
+    `LoopState`, which holds the edit with the guess that was used, so that it can be repeated.
     """
 
     edit: LoopEdit
@@ -58,7 +57,7 @@ class ApplyEdit:
 
 @dataclass(frozen=True, slots=True)
 class TryOut:
-    """What would the graph become by this edit? The answer is a `Preview`."""
+    """What would the graph become with this edit? The answer is a `Preview`."""
 
     edit: LoopEdit
 
@@ -108,7 +107,7 @@ class LoopState:
     Attributes:
         count: keyframes. finished: as in `Target`.
         corrections: (count, 4, 4), T_map_odom at each keyframe: its T_map_imu is corrections[i] @ T_odom_imu.
-        edges: all candidates as they count now, by keyframes.
+        edges: all candidates with their present verdicts, by keyframes.
         undo, redo: edits in force and taken back; the last of each is the next one.
         notices: new since the last reply.
     """
@@ -159,7 +158,7 @@ class LoopClient(Protocol):
         """
 
     def take_alarms(self) -> list[str]:
-        """What went wrong with the work itself since the last call, in sentences."""
+        """Failures of the search itself since the last call, in sentences."""
 
     def close(self) -> None:
         """Release all resources; unanswered questions are dropped."""

@@ -1,7 +1,7 @@
 """Align a place with an older one: find all alignments that fit, and the one that odometry and structure prefer.
 
-A registration shows that two submaps fit, not that they fit nowhere else, as they may in corridors and rooms that
-repeat. So registration starts from every placement that the plans allow (`plan`), within odometry's possible error.
+A registration shows that two submaps fit, but not that they fit nowhere else. In repeating corridors and rooms they
+may. So registration starts from every placement that the plans allow (`plan`), within odometry's possible error.
 """
 
 from collections.abc import Callable
@@ -16,23 +16,23 @@ from app.slam.loops.verification import Fit, Prepared, assess, refine, register,
 from app.slam.types import F64
 
 APART_M, APART_RAD = 0.8, float(np.radians(10.0))
-"""Alignments nearer to each other than this are the same one."""
+"""Alignments nearer to each other than this count as the same."""
 LEAST_OVERLAP, MOST_RESIDUAL, RESIDUAL_M = 0.6, 1.6, 0.002
-"""An alignment fits as well with at least this share of the overlap, and at most this many times the residual plus so
-many metres. (In a place that does not repeat, wrong alignments share less.)"""
+"""Another alignment fits as well if it has at least this share of the best one's overlap, and at most this many times
+its residual plus this many metres. (In a place that does not repeat, wrong alignments overlap less.)"""
 HOPEFUL, SAME_ROUGHLY = 0.5 * LEAST_OVERLAP, 0.25
 """A rough alignment is refined if it has at least this share of the best one's points and is this far from others."""
 ALONG = 0.9
-"""Least cosine between the way from one alignment to another and a direction that is open, for them to be the same."""
+"""Two alignments count as the same if the cosine between their difference and an open direction is at least this."""
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
     """Attributes:
-    fit: the best alignment. deviation: of it from odometry.
-    slides: m, by which it slid along the direction that holds least. open: that direction, (3,) unit in the target's
+    fit: the best alignment. deviation: from odometry to it.
+    slides: m, by which it slid along its least constrained direction. open: that direction, (3,) unit in the target's
         axes, if nothing holds it there. loose: whether the next direction slides too.
-    alternative_m: m to the nearest other alignment that fits as well and that odometry allows no less; inf if none.
+    alternative_m: m to the nearest other alignment that fits as well and that odometry allows as well; inf if none.
     """
 
     fit: Fit
@@ -56,13 +56,13 @@ def place(
 ) -> Placement:
     """Align a submap with another.
 
-    If the best alignment contradicts odometry, odometry cannot rule out others either: they are looked for everywhere.
+    If the best alignment contradicts odometry, odometry cannot rule out others either, so they are searched everywhere.
 
     Args:
-        T_guess: (4, 4) of the level frames, by odometry; along a direction that is open, the result stays there.
+        T_guess: (4, 4) of the level frames, by odometry; along an open direction, the result stays at this guess.
         deviation: of such a transform from odometry. most_sigmas: standard deviations up to which it is allowed.
-        most_slide: m, up to which a direction holds. height_known: an alignment at another height is wrong; others are
-            not looked for then, since their height would follow from the same ground.
+        most_slide: m of sliding, up to which a direction counts as constrained. height_known: an alignment at another
+            height is wrong; no others are searched then, since their height would follow from the same ground.
     """
     starts = [T_guess, *(placements(target, source, T_guess, window) if window.reach_m >= APART_M else ())]
     found: list[F64] = []
@@ -106,7 +106,8 @@ def place(
 
 
 def _worthwhile(roughs: list[tuple[F64, float]]) -> list[F64]:
-    """Of rough alignments (4, 4) with the share of points that fit, those that may become the best, each once."""
+    """The rough alignments (4, 4) that may become the best, without duplicates. roughs: each with its share of points
+    that fit."""
     most = max(share for _, share in roughs)
     out: list[F64] = []
     for T, share in roughs:
@@ -123,7 +124,7 @@ def _as_good(other: Fit, fit: Fit) -> bool:
 
 
 def _apart(a: F64, b: F64) -> float:
-    """How far two alignments (4, 4) are from each other; from 1 on they are two."""
+    """Distance of two alignments (4, 4); from 1 on they count as different."""
     turned = float(np.linalg.norm(lie.log(a[:3, :3] @ b[:3, :3].T)))
     return max(float(np.linalg.norm(a[:3, 3] - b[:3, 3])) / APART_M, turned / APART_RAD)
 

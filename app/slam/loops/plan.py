@@ -1,8 +1,8 @@
 """Align submaps without a good guess: compare their plans at every shift and turn.
 
-A plan is a raster of what stands upright: the taller, the more it counts. Ground fits anywhere; it only shows that
-nothing stands there. The shifts at which two plans agree best are found at once, by a circular correlation for each
-turn; heights follow from the ground. Registration begins at the best few.
+A plan is a raster of upright structure, weighted by its height. Ground fits anywhere; it only shows that nothing stands
+there. For each turn, one circular correlation compares two plans at all shifts; heights follow from the ground.
+Registration begins at the best few.
 """
 
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from app.slam.types import F32, F64, I64
 
 CELL_M = 0.4
 EDGE = 2.56
-"""Of a plan, times the reach of its submap. It wraps around, so shifts of up to `FARTHEST_M` can be distinguished."""
+"""Edge of a plan, in multiples of its submap's reach. Plans wrap around, so shifts up to `FARTHEST_M` are distinct."""
 FARTHEST_M = 11.0
 TURN = np.radians(3.0)
 """Step of the turns that are tried; at the rim of a submap it moves a point by a metre."""
 TALLEST = 8
-"""Occupied cells above one another from which a column counts no more."""
+"""Further occupied cells in a column do not increase its weight."""
 BARE = -0.4
-"""What a cell with nothing but ground counts; a column of two cells counts 1."""
+"""Weight of a column with nothing but ground; a column with two occupied cells has weight 1."""
 PEAKS = 6
 LEAST = 0.4
-"""A peak counts with at least this share of the highest."""
+"""A peak counts if it has at least this share of the highest."""
 SAME = 7
-"""Turns, and cells along both axes, within half of which only the highest peak counts."""
+"""Size of a neighbourhood, in turns and in cells along both axes, in which only the highest peak counts."""
 
 
 @dataclass(frozen=True, slots=True)

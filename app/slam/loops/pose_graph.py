@@ -1,7 +1,8 @@
-"""The graph of keyframe poses (paper 2.4, eq. 8), solved incrementally, and sound whatever the solver fails with.
+"""The graph of keyframe poses (paper 2.4, eq. 8), solved incrementally. It stays sound if the solver fails.
 
-The poses are a function of a list of steps, to the last bit. A list that goes on from the one before costs only what is
-new. Any other is done from its beginning, as is all after an exception, which leaves gtsam's solver broken.
+The poses are a function of a list of steps, to the last bit. If a list extends the previous one, only the new steps are
+solved. Any other list is solved from its beginning. So is everything after an exception, which leaves gtsam's solver
+broken.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,7 @@ class PoseGraph:
     def __init__(self, first: F64, window: int = 0) -> None:
         self._first, self._window = np.array(first, dtype=np.float64), window
         self._asked: list[Step] = []  # of `follow`
-        self._failed: tuple[Closing, ...] = ()  # among them
+        self._failed: tuple[Closing, ...] = ()  # factors of these that the solver failed with
         self._reset()
 
     def __len__(self) -> int:
@@ -42,14 +43,14 @@ class PoseGraph:
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """Those that were done, without what the solver failed with."""
+        """The steps that were done, without factors that the solver failed with."""
         return tuple(self._steps)
 
     def follow(self, steps: Sequence[Step]) -> tuple[Closing, ...]:
         """Apply these steps from the start; leading steps that are the same objects as before are not repeated.
 
         Returns:
-            All factors among them that the solver failed with; `do` says what became of each.
+            All factors of these that the solver failed with; `do` says what became of each.
         """
         known = len(self._asked)
         if len(steps) < known or any(one is not other for one, other in zip(self._asked, steps, strict=False)):
@@ -61,11 +62,11 @@ class PoseGraph:
         return self._failed
 
     def do(self, step: Factor | Sequence[Closing]) -> tuple[Closing, ...]:
-        """Add the next pose by its odometry factor, or loops and position priors of poses that are there.
+        """Add the next pose by its odometry factor, or loops and position priors of existing poses.
 
         Returns:
-            What the solver failed with. Loops and priors are left out then; odometry is replaced by a factor with a
-            large covariance.
+            Factors that the solver failed with. Such loops and priors are left out; such odometry is replaced by a
+            factor with a large covariance.
         """
         if not isinstance(step, Factor):
             step = tuple(step)
@@ -101,14 +102,14 @@ class PoseGraph:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What was measured of one keyframe. odometry: to it; None for the first. priors: of it alone."""
+    """Measurements of one keyframe. odometry: to it; None for the first. priors: of it alone."""
 
     odometry: Factor | None
     priors: tuple[PositionPrior, ...]
 
 
 class Graph:
-    """The graph of a history and of its loops as they count: a function of both, whatever was solved before.
+    """The graph of a history and of its loops with their verdicts: a function of both, whatever was solved before.
 
     It is solved in the order in which keyframes and loops came.
 
@@ -122,10 +123,10 @@ class Graph:
         self.failed: tuple[Closing, ...] = ()
 
     def solve(self, history: Sequence[Measured], edges: Edges, T_odom_imu: F64) -> F64:
-        """(k, 4, 4) T_map_imu of the history's keyframes. What was solved before with the same begins it.
+        """(k, 4, 4) T_map_imu of the history's keyframes. Steps in common with the last solution are reused.
 
         Args:
-            edges: loops as they count. T_odom_imu: (k, 4, 4).
+            edges: loops with their verdicts. T_odom_imu: (k, 4, 4).
         """
         arrivals: dict[int, list[LoopEdge]] = {}
         for edge in edges.values():
@@ -148,7 +149,7 @@ class Graph:
         return out
 
     def factors(self, history: Sequence[Measured], edges: Edges, T_odom_imu: F64) -> list[Closing]:
-        """All of the graph: odometry, priors, loops."""
+        """All factors of the graph: odometry, priors, loops."""
         odometry = [measured.odometry for measured in history if measured.odometry is not None]
         priors = [prior for measured in history for prior in measured.priors]
         return [*odometry, *priors, *loop_factors(edges.values(), edges, T_odom_imu, window=self._window)]

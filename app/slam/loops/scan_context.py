@@ -4,8 +4,8 @@ Differences from the paper, for a scanner that sees a hemisphere, also indoors:
 - A cell holds how many height bins are occupied, not the greatest height: under a ceiling the
   greatest height is the same everywhere, while walls and furniture still stand out.
 - Cells that were never seen are masked: they count for neither side of the distance.
-- Columns count from odom's x axis, not from the heading: going back the other way gives the same columns, and the best
-  shift is the drift of the heading. All shifts are compared at once, by circular correlation.
+- Columns are counted from odom's x axis, not from the heading. So going back the other way gives the same columns, and
+  the best shift is the drift of the heading. All shifts are compared at once, by circular correlation.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from app.slam.types import F32, F64
 
 RINGS, SECTORS = 20, 60
 RADIUS = 20.0
-"""m that the rings reach."""
+"""Radius of the outermost ring, m."""
 HEIGHTS = (-2.0, 6.0, 0.4)
 """Height bins relative to the IMU: from, to, step, m."""
 _BINS = round((HEIGHTS[1] - HEIGHTS[0]) / HEIGHTS[2])
 SECTOR = 2 * np.pi / SECTORS
 YAWS: F64 = (np.arange(SECTORS, dtype=np.float64) * SECTOR + np.pi) % (2 * np.pi) - np.pi
-"""(SECTORS,) rad: R_a_b about z that a shift of b's columns stands for."""
+"""(SECTORS,) rad: the rotation R_a_b about z that corresponds to each shift of b's columns."""
 LEAST_COMMON = 0.4
 """At a shift, at least this share of the smaller context's seen cells must be seen in both."""
 
@@ -55,7 +55,7 @@ def describe(points: F32) -> ScanContext:
     occupied = np.zeros((RINGS, SECTORS, _BINS), dtype=np.bool_)
     occupied[ring, sector, height[inside]] = True
     filled = occupied.sum(axis=2)
-    # a sector was looked through as far as its farthest return; behind that nothing is known
+    # a sector has been seen as far as its farthest return; nothing is known behind it
     seen = np.cumsum(filled[::-1], axis=0)[::-1] > 0
     return ScanContext(np.sqrt(filled / _BINS).astype(np.float32), seen)
 

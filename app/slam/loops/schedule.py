@@ -1,9 +1,9 @@
 """Decide when the loops that were found take effect.
 
-The client looks for loops beside the frames, at its own speed. What it finds with a keyframe takes effect
-`loops.latency` frames after it, no sooner and no later, so the poses shown never depend on the speed of the machine.
-A frame waits only if an answer is late, and never before the session is long enough for a loop: a client takes seconds
-to start. A request of the user takes effect as soon as it is answered.
+The client looks for loops in parallel to the frames, at its own speed. The loops of a keyframe take effect exactly
+`loops.latency` frames after it, so the poses shown never depend on the speed of the machine. A frame waits only if an
+answer is late, and never before the session is long enough for a loop, since a client takes seconds to start. A request
+of the user takes effect as soon as it is answered.
 """
 
 import contextlib
@@ -39,11 +39,11 @@ from app.slam.sections import LoopsParams
 from app.slam.types import I64, Keyframe
 
 UserRequest = Question | Callable[[Edits], Edits]
-"""What the user asks, or makes of the edits: `Edits.undo`, for example, which may raise HemislamError."""
+"""A question of the user, or a change of the edits, such as `Edits.undo`, which may raise HemislamError."""
 EVERY: Final = 8
-"""A state is asked for after this many keyframes, which are sent together, if no frame needs one earlier."""
+"""If no frame needs a state earlier, one is requested after this many keyframes, which are sent together."""
 MOST_AHEAD: Final = 8
-"""Questions without an answer at which frames wait all the same, so that keyframes do not pile up in memory."""
+"""With this many unanswered questions, frames wait in any case, so that keyframes do not pile up in memory."""
 STATES: Final = 512
 """States that are kept, so that going back need not solve the graph again."""
 LEFT_OUT: Final = "Edits of loops are left out: with the new settings they would change loops of other keyframes."
@@ -62,7 +62,7 @@ class _Asked:
     """A question without an answer yet.
 
     Attributes:
-        user: the user waits for it. edits: what it makes of them; None: it leaves them as they are.
+        user: whether the user waits for it. edits: the edits that it leads to; None: it leaves them as they are.
         version: of the keyframe log. visit: counts how often the session had gone to another frame.
     """
 
@@ -95,11 +95,11 @@ class LoopSchedule:
         self._params = self._start = params
         self._edits = Edits()
         self._finished = False
-        self._at_end = False  # nothing takes effect before the results
+        self._at_end = False  # if true, nothing takes effect before the results
         self._most_states = STATES
         self._states: dict[Moment, LoopState] = {}  # with the present edits
         self._wanted = Moment(0)  # what should be in effect
-        self._shown: Moment | None = self._wanted  # what is; None if that is with other edits
+        self._shown: Moment | None = self._wanted  # what is in effect; None if that is with other edits
         self._asked: deque[_Asked] = deque()
         self._requests: deque[UserRequest] = deque()  # of the user, not yet sent
         self._visit = 0
@@ -164,7 +164,7 @@ class LoopSchedule:
         self._forget(max(self._log.until(frame), self._log.count))
 
     def never_go_back(self) -> None:
-        """The session only goes on, so no past states are kept."""
+        """The session only goes forward, so no past states are kept."""
         self._most_states = 0
 
     def only_results(self) -> None:
@@ -172,7 +172,7 @@ class LoopSchedule:
         self._at_end, self._most_states = True, 0
 
     def finish(self) -> None:
-        """The session has ended: look for loops at the last keyframes too, and put all that comes into effect."""
+        """The session has ended: look for loops at the last keyframes too, and put all that is found into effect."""
         self._finished = True
         self._requests.append(AskState())
         self._ask_next()
@@ -209,7 +209,7 @@ class LoopSchedule:
 
     @property
     def edits(self) -> Edits:
-        """The user's, also those that are asked for and not in effect yet."""
+        """The user's edits, including those that are requested but not yet in effect."""
         edits = next((asked.edits for asked in self._asked if asked.edits is not None), self._edits)
         for request in self._requests:
             with contextlib.suppress(HemislamError):
@@ -248,7 +248,7 @@ class LoopSchedule:
         return taken
 
     def results(self) -> LoopResults:
-        """All that is written of loops, with all keyframes so far, whether in effect or not. Waits for it."""
+        """All that files hold about loops, with all keyframes so far, whether in effect or not. Waits for it."""
         if self._at_end:
             self.command(AskState())
         self.command(AskG2o())
@@ -265,11 +265,11 @@ class LoopSchedule:
     # --- asking ----------------------------------------------------------------------------------
     @property
     def _editing(self) -> bool:
-        """Whether the edits that hold are not known until an answer comes."""
+        """Whether the edits in force are unknown until an answer comes."""
         return any(asked.edits is not None for asked in self._asked)
 
     def _ask_next(self) -> None:
-        """Send what can be asked with the edits that are known: the user's requests, then states that are lacking."""
+        """Send what can be asked with the known edits: the user's requests, then states that are missing."""
         while self._requests and not self._editing:
             self._ask_for_user(self._requests.popleft())
         if self._editing:
@@ -334,7 +334,7 @@ class LoopSchedule:
             self._edits = Edits(state.undo, state.redo)
             self._forget_states()
         if self._log.keep(Cursor(asked.version, state.count)) < state.count:
-            return  # of keyframes that were replaced since
+            return  # its keyframes have been replaced since
         moment = Moment(state.count, state.finished)
         if self._at_end:
             self._states.clear()
@@ -355,7 +355,7 @@ class LoopSchedule:
             self._put(self._without_loops(self._wanted))
 
     def _too_early(self, count: int) -> bool:
-        """Whether no two of the first `count` keyframes are far enough apart in time for a loop, nor tied by hand."""
+        """Whether the first `count` keyframes can have no loop: none are far enough apart in time, or tied by hand."""
         entries = self._log[:count]
         return not self._edits.done and all(
             entry.stamp_ns - entries[0].stamp_ns < entry.params.min_time * 1e9 for entry in entries
@@ -387,7 +387,7 @@ class LoopSchedule:
 
 
 def _after(edits: Edits, request: UserRequest) -> Edits:
-    """What a request of the user makes of the edits. Raises HemislamError: it cannot be done."""
+    """The edits after a request of the user. Raises HemislamError: it cannot be done."""
     if isinstance(request, ApplyEdit):
         check(request.edit)
         return Edits((*edits.done, request.edit))

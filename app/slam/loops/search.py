@@ -1,8 +1,8 @@
-"""The search for loops: what was found with each keyframe of a session. The user's edits play no part in it.
+"""The search for loops at each keyframe of a session. The user's edits play no part in it.
 
-Each keyframe appends to a history; going back means reading less of it. What is found with a keyframe depends only on
-the keyframes up to it, so the search for it runs once. To know where to look, the search has a graph of its own, of the
-loops as they were found.
+Each keyframe appends to a history; going back means reading less of it. The loops found at a keyframe depend only on
+the keyframes up to it, so each keyframe is searched once. To know where to look, the search has a graph of its own,
+made of the loops as they were found.
 """
 
 from collections.abc import Sequence
@@ -25,12 +25,12 @@ from app.slam.sections import LoopsParams
 from app.slam.types import F64, Keyframe
 
 SURE_M = 0.3
-"""If odometry knows its position better than this (standard deviation), one place that fits is enough."""
+"""If odometry's position is more certain than this (standard deviation), one place that fits is enough."""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Result of a search: contexts from keyframe `first` on, which had none, and candidates, new or changed."""
+    """Result of a search: contexts that were missing, from keyframe `first` on, and new or changed candidates."""
 
     first: int = 0
     contexts: tuple[ScanContext, ...] = ()
@@ -51,11 +51,11 @@ class Search:
         self.detector = Detector(self.start)
         self.found: dict[Pair, LoopEdge] = {}
         self.finished = False
-        self._params: list[LoopsParams] = []  # with each keyframe
+        self._params: list[LoopsParams] = []  # for each keyframe
         self._measured: list[Measured] = []
         self._loose: dict[int, Measured] = {}  # weakened odometry of keyframes before which it slipped
-        self._found: list[Found | None] = []  # with each; None until loops were looked for
-        self._ends: dict[int, Found] = {}  # found in addition where the session ended, by the number of keyframes
+        self._found: list[Found | None] = []  # for each keyframe; None until loops were looked for
+        self._ends: dict[int, Found] = {}  # found in addition at the session's end, by the number of keyframes
         self.graph = Graph(np.eye(4), 0)
 
     def __len__(self) -> int:
@@ -68,13 +68,13 @@ class Search:
 
     @property
     def measured(self) -> Sequence[Measured]:
-        """Of the first `len` keyframes. Where a slip of odometry was detected, the graph may bend."""
+        """Measurements of the first `len` keyframes. At a detected slip, odometry is weak, so that the graph can bend."""
         seen = len(self) - slips.REACH
         return [self._loose.get(k, one) if k <= seen else one for k, one in enumerate(self._measured[: len(self)])]
 
     @property
     def solved(self) -> tuple[F64, dict[Pair, LoopEdge]]:
-        """(k, 4, 4) T_map_imu of the first `len` keyframes, and the loops as they count, without any edits."""
+        """(k, 4, 4) T_map_imu of the first `len` keyframes, and the loops with their verdicts, without any edits."""
         edges = apply_edits(self.found, (), {})
         poses = self.graph.solve(self.measured, edges, self.detector.poses)
         return poses, self.graph.sound(edges)
@@ -85,7 +85,8 @@ class Search:
     def add(self, keyframe: Keyframe, params: LoopsParams, priors: tuple[PositionPrior, ...] = ()) -> None:
         """Take the next keyframe, and look for loops of the newest one whose surroundings are complete.
 
-        If the history has the same keyframe next, nothing is computed again. Raises HemislamError if one is missing.
+        If the same keyframe comes next in the history, nothing is computed again.
+        Raises HemislamError if one is missing.
 
         Args:
             priors: what was measured of this keyframe alone.
@@ -140,7 +141,7 @@ class Search:
         self.detector.forget()
 
     def _is_known(self, keyframe: Keyframe, params: LoopsParams) -> bool:
-        """Whether the history has this keyframe next, with the same parameters."""
+        """Whether this keyframe, with the same parameters, comes next in the history."""
         index = len(self)
         if index == self.known or self._params[index] != params:
             return False
@@ -163,7 +164,7 @@ class Search:
         self._take(found)
 
     def _look_for_slip(self, index: int) -> None:
-        """On the step to a keyframe, once the few after it have come."""
+        """Look for a slip of odometry on the step to a keyframe, once the few keyframes after it have come."""
         if index > 0 and self.start.enabled and (slip := self.detector.slip(index)) is not None:
             measured, after = self._measured[index], self.detector.poses[index]
             assert measured.odometry is not None

@@ -1,4 +1,4 @@
-"""The loop back end behind one method, and the client that runs it in the caller's own process."""
+"""The loop back end behind a single method, and the client that runs it in the caller's own process."""
 
 from collections import deque
 
@@ -40,7 +40,7 @@ class LoopService:
         self._backend = LoopBackend()
 
     def handle(self, request: Request) -> Reply:
-        """The answer. What cannot be done gives a `Failure`, never an exception."""
+        """The answer. A request that cannot be met gives a `Failure`, never an exception."""
         try:
             return self.add(request) if isinstance(request, AddKeyframe) else self.answer(request)
         except HemislamError as error:

@@ -1,7 +1,7 @@
-"""Detect where odometry slipped: surfaces seen just before and just after do not coincide there.
+"""Detect where odometry slipped: surfaces seen just before the slip and just after it do not coincide.
 
-A submap across a slip holds every surface twice. A cloud registered to it ends up in between, or on the part that does
-not belong to the submap's keyframe.
+A submap across a slip holds every surface twice. A cloud registered to such a submap ends up between the two copies, or
+on the copy that does not belong to the submap's keyframe.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Slip:
     """Attributes:
     moved: (6,) rad and m, how far registration moves the surroundings seen after a step from where odometry places
         them: rotation about their origin, then translation, in level axes.
-    is_break: whether it is so large and so well seen that odometry is no evidence across the step.
+    is_break: whether the slip is so large and so well seen that odometry across the step is no evidence.
     """
 
     moved: F64
@@ -42,8 +42,8 @@ def slip(before: Prepared, after: Prepared, T_guess: F64) -> Slip | None:
     """How odometry slipped on a step; None if it is right within `LIKELY` standard deviations.
 
     Args:
-        before, after: what was seen on either side of it. T_guess: (4, 4) T_before_after of the level frames, by
-            odometry.
+        before, after: surroundings seen on either side of the step. T_guess: (4, 4) T_before_after of the level frames,
+            by odometry.
     """
     T = register(before, after, T_guess)
     moved = np.concatenate([lie.log(T[:3, :3] @ T_guess[:3, :3].T), T[:3, 3] - T_guess[:3, 3]])

@@ -25,7 +25,7 @@ from app.slam.types import F64
 RELINEARISE = 0.05
 """Change of a pose (rad, m) from which its factors are linearised again."""
 MOST_UPDATES = 5
-"""After a loop the update is repeated while the newest pose moves more than that, at most this often."""
+"""After a loop, the update is repeated while the newest pose moves by more than that, at most this many times."""
 _HELD = 1e-6
 """Standard deviation (rad, m) with which the first pose is held."""
 _FIRST = np.full(6, _HELD)
@@ -37,7 +37,7 @@ def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64,
     """(n, 4, 4) the optimum of all factors at once, by Levenberg-Marquardt from (n, 4, 4) `start`.
 
     Args:
-        free: the first pose is held to a degree of rotation only; position priors determine the rest.
+        free: the first pose is held only in rotation, to a degree; position priors determine the rest.
 
     Raises:
         ArithmeticError: the solver failed.
@@ -57,7 +57,7 @@ def optimise(first: F64, factors: Sequence[Closing], start: Sequence[F64] | F64,
 
 
 def read_g2o(text: str) -> list[Factor]:
-    """The factors of the text of a g2o file. Loops are robust again. Raises RuntimeError: it cannot be read."""
+    """The factors in the text of a g2o file; loops become robust again. Raises RuntimeError: it cannot be read."""
     with tempfile.TemporaryDirectory(prefix="hemislam-") as folder:  # gtsam reads files only
         path = Path(folder) / "graph.g2o"
         path.write_text(text, encoding="utf-8")
@@ -90,9 +90,9 @@ def g2o_text(poses: F64, factors: Iterable[Closing]) -> str:
 class Incremental:
     """Every pose is solved for (iSAM2; Kaess et al. 2012).
 
-    The solver holds the poses that loops tie; odometry between two of them is one factor. All other poses follow from
-    these (`Chain`), so the cost grows with the loops, not with the length of the session. Loops between the same two
-    poses are also one factor, their mean.
+    The solver holds only the poses that loops tie; odometry between two of these is one factor. All other poses follow
+    from them (`Chain`), so the cost grows with the loops, not with the length of the session. Loops between the same
+    two poses are merged into one factor, their mean.
 
     Attributes:
         count: of poses. newest: (4, 4), the last of them.
@@ -102,13 +102,13 @@ class Incremental:
         self.count, self.newest = 1, first
         self._isam = gtsam.ISAM2(_params())
         self._isam.update(*_start(first))
-        self._factors = 1  # ever given to the solver
+        self._factors = 1  # number given to the solver so far
         self._chain = Chain(first)
         self._tied = [KeyframeId(0, 0)]
         self._odometry: dict[Pair, int] = {}  # number of the factor between two of these
         self._loops: dict[tuple[KeyframeId, ...], _Mean] = {}
         self._poses: Rows[np.float64] | None = Rows((4, 4), np.float64, [first])  # None: loops have moved them since
-        self._ahead: list[F64] = []  # the poses after those
+        self._ahead: list[F64] = []  # poses after these
 
     def update(self, step: Step) -> None:
         """Raises what gtsam raises, IndexError, ValueError and ArithmeticError; the solver is broken then."""
@@ -189,7 +189,7 @@ class _Mean:
     """Loops between the same two poses as one factor: their squared errors add up to that of the mean, plus a constant.
 
     Attributes:
-        factor: their mean, each by its information. times: how many they are. number: the solver's.
+        factor: their mean, weighted by information. times: number of loops. number: of the factor in the solver.
     """
 
     def __init__(self, loop: Factor) -> None:
@@ -197,7 +197,7 @@ class _Mean:
         self.number: int | None = None
 
     def take(self, loop: Factor) -> None:
-        """One more."""
+        """Add one more loop."""
         before, own = np.linalg.inv(self.factor.covariance), np.linalg.inv(loop.covariance)
         covariance = np.linalg.inv(before + own)
         T = self.factor.T_first_second
@@ -247,7 +247,7 @@ class Windowed:
 
 
 def _settled(solver: Any, newest: int, before: F64) -> F64:
-    """The newest pose, after updates as long as they move it so far that it has to be linearised again."""
+    """The newest pose, after repeating the update while it moves so far that it has to be linearised again."""
     for _ in range(MOST_UPDATES):
         after = _estimate(solver, newest)
         if not np.abs(after - before).max() > RELINEARISE:
@@ -273,13 +273,13 @@ def _params() -> gtsam.ISAM2Params:
     params.setRelinearizeThreshold(RELINEARISE)
     params.relinearizeSkip = 1
     exact = gtsam.ISAM2GaussNewtonParams()
-    exact.setWildfireThreshold(0.0)  # otherwise looking at the estimate would change the next one
+    exact.setWildfireThreshold(0.0)  # otherwise reading an estimate would change the next one
     params.setOptimizationParams(exact)
     return params
 
 
 def _noise(factor: Closing, times: int = 1) -> gtsam.noiseModel.Base:
-    """times: how many loops it is the mean of. Huber's limit grows so that they pull as far as each would alone."""
+    """times: number of loops in the mean. Huber's limit grows so that together they pull as far as each would alone."""
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if not factor.robust:
         return noise

@@ -2,8 +2,8 @@
 
 The sensor sees only the hemisphere ahead; what lies behind was seen from the keyframes before.
 A submap lives in its keyframe's LEVEL frame: origin at the IMU, axes those of `odom`, so z is up
-and neighbours only have to be shifted. Poses within a submap are the odometry's, which no loop
-changes, so a submap never has to be made again.
+and neighbours only have to be shifted. Poses within a submap are those of odometry, which no
+loop changes, so a submap never has to be rebuilt.
 """
 
 import os
@@ -84,7 +84,7 @@ class Submaps:
         return Submap(index, thin.points, eyes[seen // 2], reach)
 
     def _level(self, keyframe: Keyframe) -> tuple[F32, F32]:
-        """(n, 3) one keyframe's own points in its level frame, thinned: those that are near, and the rest."""
+        """One keyframe's own points (n, 3) in its level frame, thinned: the near ones, and the rest."""
         T = keyframe.T_imu_lidar.copy()
         T[:3] = keyframe.T_odom_imu[:3, :3] @ T[:3]
         points = keyframe.cloud.points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)

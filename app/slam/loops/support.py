@@ -1,6 +1,6 @@
-"""Candidates are compared: those that enough others agree with, and few contradict, are accepted.
+"""Compare candidates: a candidate is accepted if enough others agree with it and few contradict it.
 
-A place that looks the same can fool one registration; it rarely fools several at different keyframes in the same way.
+A place that looks the same can fool one registration, but rarely several at different keyframes in the same way.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -22,15 +22,15 @@ NAMED = 5
 NEIGHBOURHOOD_M = 15.0
 """Loops whose ends are farther apart than this along the trajectory, on either side, are not compared."""
 ELSEWHERE_M = 1e6
-"""What a pause counts as along the trajectory: odometry tells nothing across it."""
+"""m of trajectory that a pause counts as: odometry tells nothing across it."""
 SAME = 2 * LOOP_HUBER
 """Standard deviations up to which two nearby loops count as the same; there Huber's loss halves the pull."""
 AGREE = 3.0
 """Standard deviations up to which two loops agree."""
 OUTVOTING, STRETCH_M = 2, 4.0
-"""To outvote odometry, this many times as many loops must agree, and their newer ends must span this distance."""
+"""To outvote odometry, this many times as many loops must agree, and their newer ends must span this distance, m."""
 NO_NEWS = 1.0
-"""The same limit beyond a submap's length. It is strict, as the covariances of loops are generous."""
+"""The limit `SAME` beyond a submap's length. It is strict, as the covariances of loops are generous."""
 
 
 def settle(
@@ -45,9 +45,9 @@ def settle(
     """Verdicts on new candidates, and on earlier ones that they support or contradict.
 
     Args:
-        fresh: new candidates with a verdict on each alone. edges: all, including those, as they count with the
-            user's edits. A candidate that the user decided on is left alone.
-        poses: (k, 4, 4) T_odom_imu. pauses_before: (k,) their number, of each. now: newest keyframe.
+        fresh: new candidates with a verdict on each alone. edges: all candidates, including `fresh`, with the user's
+            edits applied. A candidate that the user decided on is left alone.
+        poses: (k, 4, 4) T_odom_imu. pauses_before: (k,) number of pauses before each. now: newest keyframe.
 
     Returns:
         All of `fresh`, and earlier candidates whose verdict changed, without the user's edits.
@@ -66,7 +66,7 @@ def settle(
             continue
         others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
         agree = _agree(edge, others, poses, np.array([sum(ways(edge, o)) for o in others]), drift) if others else ()
-        # an ambiguous one that agrees supports nothing: all seen there may belong to a place that looks the same
+        # an ambiguous loop that agrees is no support: all that is seen there may belong to a place that looks the same
         agreeing = [o.newer for o, yes in zip(others, agree, strict=True) if yes and not o.evidence.ambiguous]
         contradicting = [o.pair for o, yes in zip(others, agree, strict=True) if not yes]
         support, against = len({*agreeing} - {edge.newer}), len(contradicting)
@@ -98,8 +98,8 @@ def settle(
 
 
 def _agree(edge: LoopEdge, others: Sequence[LoopEdge], poses: F64, ways: F64, drift: Drift) -> npt.NDArray[np.bool_]:
-    """Which of the others agree with a loop: the cycle of both and the odometry between their ends closes within its
-    uncertainty.
+    """Which of the others agree with a loop: the cycle of both loops and of the odometry between their ends closes
+    within its uncertainty.
 
     Args:
         poses: (k, 4, 4) by odometry. ways: (n,) m along the trajectory between the older ends, plus between the newer.
@@ -110,7 +110,7 @@ def _agree(edge: LoopEdge, others: Sequence[LoopEdge], poses: F64, ways: F64, dr
 
 
 def _rivals(edge: LoopEdge, alive: Sequence[LoopEdge], walked: F64, poses: F64, drift: Drift) -> int:
-    """Number of loops from about the same place that lead elsewhere, span more odometry and deviate from it by less."""
+    """Number of loops from about the same place that lead elsewhere, span more odometry and deviate less from it."""
     less = [o for o in alive if not o.evidence.ambiguous and o.evidence.mahalanobis < edge.evidence.mahalanobis]
     older, newer = (_ends(less, walked) - walked[[*edge.pair]]).T
     chosen = np.flatnonzero((older < -NEIGHBOURHOOD_M) & (np.abs(newer) < NEIGHBOURHOOD_M))
@@ -136,15 +136,15 @@ def placed(
 ) -> list[LoopEdge]:
     """The same candidates; accepted ones name the loop that represents them or that they repeat, if there is one.
 
-    Tying a new pose costs the solver far more than a further measurement between poses that are tied already. So:
+    Tying a new pose costs the solver far more than a further measurement between poses that are already tied. So:
     - Loops whose keyframes are a quarter of a submap apart at both ends share most points: they are one measurement.
-    - Of loops whose submaps share points and that measured the same, one ties poses; the others repeat it.
-    - A loop that the graph already predicts, to `SAME` within a submap's length of the last tie or to `NO_NEWS` within
-      two, is represented by that tie. Otherwise the graph would grow denser with every visit to a place.
+    - If the submaps of several loops share points and the loops agree, one of them ties poses; the others repeat it.
+    - A loop that the graph already predicts is represented by the last tie: to `SAME` within a submap's length of that
+      tie, to `NO_NEWS` within two. Otherwise the graph would grow denser with every visit to a place.
 
     Args:
-        edges: all, as they count. T_odom_imu, T_map_imu: (k, 4, 4). pauses_before: (k,) their number, of each;
-            only loops with equal numbers at both ends are compared. half: of a submap, in keyframes.
+        edges: all, with their verdicts. T_odom_imu, T_map_imu: (k, 4, 4). pauses_before: (k,) number of pauses before
+            each; only loops with equal numbers at both ends are compared. half: of a submap, in keyframes.
     """
     counting = {edge.pair: edge for edge in edges if edge.counts}
     out = []
@@ -183,7 +183,7 @@ def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_m
 
 
 def transported(edges: Sequence[LoopEdge], first: LoopEdge, T_odom_imu: F64) -> tuple[F64, F64]:
-    """Loops' measurements, transported by odometry to the keyframes of one nearby: T (n, 4, 4), covariances (n, 6, 6).
+    """Loops transported by odometry to the keyframes of a nearby one: T (n, 4, 4) and covariances (n, 6, 6).
 
     Args:
         T_odom_imu: (k, 4, 4); taken as exact between ends that are near each other.

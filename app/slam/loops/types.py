@@ -43,13 +43,13 @@ class Evidence:
     Attributes:
         context_distance: of the two Scan Contexts at the best column shift, 0 (same) to 1.
         overlap: share of points near both keyframes that have a partner in the other submap, 0-1.
-        residual_rms: m, point to plane, of those.
+        residual_rms: m, point to plane, of the points with a partner.
         condition: smallest eigenvalue of the registration's translation information over its
             largest, 0-1; near 0 the two submaps slide along each other.
         slide: m, how far registrations from disturbed starts ended from the result, along its least certain direction.
         alternative_m: m to the nearest other alignment that fits as well and that odometry also allows; inf if
             there is none.
-        mahalanobis: distance to what odometry predicts, in standard deviations.
+        mahalanobis: distance from odometry's prediction, in standard deviations.
         gate_m: m, standard deviation of that prediction's position.
         support: number of other candidates nearby that agree.
     """
@@ -88,14 +88,14 @@ class LoopEdge:
     """One loop candidate and its verdict. Compared by identity; `same` compares values.
 
     Attributes:
-        older, newer: the keyframes. decided_at: the newest keyframe when the verdict fell.
+        older, newer: the keyframes. decided_at: the newest keyframe at the time of the verdict.
         T_older_newer: (4, 4) of the IMU frames, as registered, read-only.
         covariance: (6, 6) of that, rotation then translation, in the newer's IMU frame (right perturbation), read-only.
         verdict, reason: the reason in words and numbers.
         origin: who proposed it. edited: whether the verdict is the user's.
-        weight: divides the covariance in the graph; only of this loop, not of those that repeat it.
+        weight: divides the covariance in the graph, of this loop only, not of loops that repeat it.
         represented_by: the loop that is in the graph in place of this one: a neighbour whose submaps share most
-            points, or the last loop that ties poses if the graph already says the same.
+            points, or, if the graph already predicts this one, the last loop that ties poses.
         repeats: a loop up to a submap's length away that measured the same. This one becomes a further measurement
             between that loop's keyframes and ties no poses of its own.
         contradicted_by: loops nearby that do not agree with this candidate, at most `support.NAMED` of them.
@@ -158,7 +158,7 @@ def difference(before: Iterable[LoopEdge], after: Iterable[LoopEdge]) -> LoopCha
 
 
 def changed_by(change: LoopChange, before: Iterable[LoopEdge]) -> tuple[LoopEdge, ...]:
-    """The candidates, by pair, that a change makes of those `before`: the inverse of `difference`."""
+    """The candidates, by pair, after a change of those `before`: the inverse of `difference`."""
     edges = {edge.pair: edge for edge in (*before, *change.changed)}
     for pair in change.gone:
         del edges[pair]
@@ -171,7 +171,7 @@ class FactorResidual:
     """The residual of one factor of the graph.
 
     Attributes:
-        pair: keyframes. loop: or odometry. rotation: deg. translation: m.
+        pair: keyframes. loop: whether it is a loop; else odometry. rotation: deg. translation: m.
         sigmas: length of the whitened error, in standard deviations.
     """
 
@@ -204,8 +204,8 @@ class LoopDetail:
     Attributes:
         older, newer: (n, 3) submap points, each in its own level frame.
         T_imu_level: (4, 4) the older keyframe's IMU frame from its level frame: a rotation.
-        T_guess: (4, 4) older's level frame from newer's, by odometry if the loop counts, else by the graph.
-        T_registered: by the edge.
+        T_guess: (4, 4) T_older_newer of the level frames, by odometry if the loop counts, else by the graph.
+        T_registered: the same by the loop's registration.
         older_context, newer_context: (rings, sectors), nan where never seen.
         shift_distances: (sectors,) distance over column shifts.
         residuals: (k,) m, point-to-plane, of the newer's points that have a partner.

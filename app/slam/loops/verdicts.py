@@ -17,15 +17,15 @@ from app.slam.sections import LoopsParams
 from app.slam.types import F64
 
 SURE_M = 0.1
-"""If odometry knows its position better than this (standard deviation), places are not searched beside its guess."""
+"""If odometry's position is more certain than this (standard deviation), no places beside its guess are searched."""
 LOOSE_M = 10.0
-"""Standard deviation of a registration along a direction that nothing holds."""
+"""Standard deviation of a registration along an unconstrained direction."""
 FLOOR_M, FLOOR_YAW, FLOOR_TILT = 0.04, np.radians(0.5), np.radians(1.5)
 """Least standard deviations of a registration, however many points it has. A mounting error tilts clouds differently at
 different headings, so odometry, which observes gravity, is better in roll and pitch."""
 NEAR_M, FAR_M = 5.0, 10.0
-"""Places farther apart are not tied: an error of 1 degree in the mounting moves one by 0.1 m as seen from the other.
-Across a pause of the recording, that is better than no tie."""
+"""m: places farther apart are not tied: an error of 1 degree in the mounting moves one by 0.1 m as seen from the other.
+Across a pause of the recording, such a tie is better than none, so the second limit applies."""
 POINT_M, INDEPENDENT = 0.1, 0.05
 """Standard deviation of a point's distance to a plane, including systematic errors, and the share of points whose
 errors are independent of their neighbours'."""
@@ -37,7 +37,7 @@ def judge(
     """Register a sighting and check it against the limits: a candidate if it meets all, else rejected.
 
     Args:
-        broken: whether odometry broke between the two; only then may loops outvote it however far off it is.
+        broken: whether odometry broke between the two; only then may loops outvote it, however far off it is.
     """
     older, newer = sighting.older, sighting.newer
     guess = detector.guess(older, newer, expectation.poses)
@@ -137,9 +137,9 @@ def covariance(detector: Detector, newer: int, fit: Fit, along: F64 | None = Non
 def uncertainty_along(place: Placement, T_guess: F64, odometry: F64) -> tuple[F64, float]:
     """A direction (3,), and the standard deviation, m, to add along it to what a registration's points tell.
 
-    It is the direction that is open, or else the one that holds least. If odometry, of covariance (3, 3) in the level
-    frame, is the more certain along it, the registration may have ended beside the truth, as between rows of parked
-    cars. Then it counts for less the more it contradicts odometry.
+    It is the open direction or, without one, the least constrained direction. If odometry, of covariance (3, 3) in the
+    level frame, is more certain along it than the registration, the registration may be wrong, as between rows of
+    parked cars. Then it counts for less the more it contradicts odometry.
     """
     if place.open is not None:
         return place.open, LOOSE_M
@@ -182,7 +182,7 @@ def _objection(place: Placement, e: Evidence, p: LoopsParams, near_m: float) -> 
 
 
 def _far_off(deviation: Deviation, e: Evidence, p: LoopsParams) -> str:
-    """Why odometry that did not break rules a loop out, however many others agree with it; "" if it does not."""
+    """Why unbroken odometry rules a loop out, however many other loops agree with it; "" if it does not."""
     if deviation.height_sigmas > p.max_mahalanobis:
         away = f"{abs(deviation.height):.1f} m {'above' if deviation.height > 0 else 'below'}"
         off = f"{deviation.height_sigmas:.1f} σ, most {p.max_mahalanobis:g} σ"

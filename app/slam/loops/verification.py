@@ -36,7 +36,7 @@ FITS_M = 0.15
 PARTNER_M = 0.3
 """A point with another within this distance in the other submap has a partner."""
 COMMON = 0.75
-"""Overlap is judged on points this near to both keyframes, of the reach: there both submaps are dense."""
+"""Overlap is judged on points within this share of the reach from both keyframes, where both submaps are dense."""
 BARE = 0.05
 """A place is bare if less than this share of its flat points is upright."""
 LEAST_UPRIGHT = 50
@@ -51,9 +51,9 @@ class Prepared:
 
     Attributes:
         points: (n, 3). normals: (n, 3) unit, towards where the point was seen from.
-        flat: (n,) bool. level: (n,) of ground; upright: (n,) of what is neither ground nor ceiling.
-        tree: over the points; None if there are none. chosen, few: indices of flat points that take part as source, and
-            of those that do for a rough answer. judged: indices of upright points on which overlap is judged.
+        flat: (n,) bool. level: (n,) whether ground. upright: (n,) whether neither ground nor ceiling.
+        tree: over the points; None if there are none. chosen, few: indices of flat points that take part as source in a
+            registration and in a rough one. judged: indices of upright points on which overlap is judged.
     """
 
     submap: Submap
@@ -69,7 +69,7 @@ class Prepared:
 
     @property
     def bare(self) -> bool:
-        """Whether hardly anything near holds the place in plan."""
+        """Whether hardly anything nearby constrains the horizontal position."""
         return int(np.count_nonzero(self.flat & self.upright)) < BARE * int(np.count_nonzero(self.flat))
 
 
@@ -133,19 +133,19 @@ def rough(target: Prepared, source: Prepared, T_guess: F64) -> tuple[F64, float]
 
 
 def register(target: Prepared, source: Prepared, T_rough: F64) -> F64:
-    """The same from where `rough` ends, to a centimetre or so."""
+    """The same, starting from the result of `rough`, to a centimetre or so."""
     return _align(target, source, T_rough, source.few, FINE)[0]
 
 
 def refine(target: Prepared, source: Prepared, T: F64) -> F64:
-    """The same from where `register` ends, with more points."""
+    """The same, starting from the result of `register`, with more points."""
     return _align(target, source, T, source.chosen, FINE)[0]
 
 
 def _align(
     target: Prepared, source: Prepared, T_guess: F64, chosen: I64, one_pass: tuple[float, float, int]
 ) -> tuple[F64, float]:
-    """By Gauss-Newton with Cauchy weights. Returns the pose, and the share of the chosen points that fit there."""
+    """Align by Gauss-Newton with Cauchy weights. Returns the pose and the share of the chosen points that fit there."""
     T, turn = T_guess.copy(), np.empty((3, 3))
     points, normals = source.points[chosen], source.normals[chosen]
     reach, scale, iterations = one_pass
@@ -179,9 +179,9 @@ def information(target: Prepared, source: Prepared, T: F64) -> F64:
 
 
 def slide(target: Prepared, source: Prepared, fit: Fit, direction: F64) -> float:
-    """m that registrations pushed off along a direction (3,), both ways, end from the result along it.
+    """m along a direction (3,) between the result and where registrations end that were pushed off it, both ways.
 
-    Between features that hold, both come back; along a plain corridor they stay where they were put.
+    If features constrain this direction, both come back; along a plain corridor they stay where they were put.
     """
     ends = []
     for sign in (-1.0, 1.0):
