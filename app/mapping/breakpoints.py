@@ -1,4 +1,4 @@
-"""Conditions at which playing pauses, and sentences that say which ones held.
+"""Conditions at which playing pauses, and sentences that say which of them were met.
 
 `BREAKPOINTS` declares them: a new one is one entry and one function. The page, REST and session files read the table.
 """
@@ -16,14 +16,14 @@ from app.slam.types import StepResult
 
 @dataclass(frozen=True, slots=True)
 class CheckedFrame:
-    """A frame as the breakpoints see it: its result, and its error to the truth (m; nan)."""
+    """A frame as the breakpoints see it: its result, and its distance to the truth (m; nan if unknown)."""
 
     result: StepResult
     error: float = math.nan
 
 
 Find = Callable[[CheckedFrame, float], list[str]]
-"""Why a condition with this limit holds at a frame, in sentences; none if it does not."""
+"""Why a condition with this limit is met at a frame, in sentences; none if it is not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Breakpoint:
 
     Attributes:
         title, hint: for the page. limit: None for a switch.
-        event: counts at every frame. Other conditions count where they begin, so that Play goes on from there.
+        event: pauses at every frame that meets it. Other conditions pause only where they begin, so that Play goes on.
     """
 
     name: str
@@ -81,7 +81,7 @@ def _dropped(moment: CheckedFrame, _: float) -> list[str]:
 
 
 def _over(value: Callable[[CheckedFrame], float], sentence: str, scale: float = 1.0) -> Find:
-    """A number of the frame exceeds the limit. sentence: with places for both, times `scale`."""
+    """A number of the frame exceeds the limit. sentence: with placeholders for both, times `scale`."""
 
     def find(moment: CheckedFrame, limit: float) -> list[str]:
         now = value(moment)
@@ -148,7 +148,7 @@ def reasons(breakpoints: Breakpoints, before: CheckedFrame | None, now: CheckedF
     """Why to pause at `now`, one sentence each; none: go on.
 
     Args:
-        before: the frame before; None: unknown, so that every condition begins now.
+        before: the previous frame; None: unknown, so that every condition begins now.
     """
     found: list[str] = []
     for name, limit in breakpoints.chosen.items():

@@ -1,6 +1,6 @@
-"""States of a session to go back to: dense near the present, sparse far from it, within a budget.
+"""States of a session to go back to: dense near the present frame, sparse far from it, within a budget of memory.
 
-Which ones are kept follows from frame numbers and sizes alone, never from the clock.
+Which states are kept follows from frame numbers and sizes alone, never from the clock.
 """
 
 import logging
@@ -16,11 +16,11 @@ log = logging.getLogger(__name__)
 
 DEFAULT_BYTES = 1 << 30
 EVERY = 10
-"""Frames between two checkpoints. One takes a tenth to a half of a frame's time."""
+"""Frames between two checkpoints. Taking one costs a tenth to a half of a frame's time."""
 NEAR = 24
 """Each of this many frames before the target of a seek gets a checkpoint, so that stepping back is immediate."""
 DENSE = 16_000
-"""Up to this distance from the present, checkpoints stay `EVERY` frames apart; at twice the distance, twice as far."""
+"""Up to this many frames from the present, checkpoints are `EVERY` frames apart; at twice the distance, twice as far."""
 DISK_SHARE = 4
 """Disk space for checkpoints, in multiples of the memory; beyond it they become sparser."""
 START = -1
@@ -28,7 +28,7 @@ START = -1
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A session after a frame, without the frames themselves. place: in its feed."""
+    """The state of a session after a frame, without the frames themselves. place: its place in the feed."""
 
     frame: int
     engine: EngineState
@@ -36,7 +36,7 @@ class Checkpoint:
 
 
 class Checkpoints:
-    """States by the frame they were taken after, in an unnamed temporary database. That of frame -1 is always kept.
+    """States by the frame after which they were taken, in an unnamed temporary database. That of -1 is always kept.
 
     Args:
         budget: bytes in memory; the rest is on disk.
@@ -58,11 +58,11 @@ class Checkpoints:
 
     @property
     def nbytes(self) -> int:
-        """In memory and on disk."""
+        """Bytes in memory and on disk."""
         return sum(self._sizes.values())
 
     def wanted(self, frame: int, *, near: bool = False) -> bool:
-        """Whether to take one after this frame. near: the frame is just before the target of a seek."""
+        """Whether to take a checkpoint after this frame. near: the frame is just before the target of a seek."""
         return frame not in self._sizes and (near or frame == START or frame % EVERY == 0)
 
     def add(self, frame: int, state: object) -> None:
@@ -92,7 +92,7 @@ class Checkpoints:
         return pickle.loads(value)
 
     def drop(self, frames: list[int]) -> None:
-        """Release those of these frames."""
+        """Drop the states of these frames."""
         self._states.executemany("DELETE FROM states WHERE frame = ?", [(frame,) for frame in frames])
         for frame in frames:
             del self._sizes[frame]

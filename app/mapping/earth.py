@@ -24,14 +24,14 @@ from app.slam.loops.solvers import read_g2o
 from app.slam.map_frame import MapFrame
 
 FIX, POINT = "fix ", "point "
-"""What an edit names begins with one of them."""
+"""The name of the subject of an `Override` begins with one of these."""
 
 
 def georeference(results: Results, survey: Survey, edits: Sequence[LoopEdit] = ()) -> Results:
-    """The results where they are on Earth, with how fixes or points lie on them.
+    """The results with their place on Earth, and with the residuals of the fixes or control points.
 
     Raises:
-        HemislamError: the survey cannot be read, or leaves open where the map lies.
+        HemislamError: the survey cannot be read, or does not determine where the map lies.
     """
     if not len(results.trajectory):
         raise HemislamError("Nothing is mapped yet that could be georeferenced.")
@@ -56,7 +56,7 @@ def georeference(results: Results, survey: Survey, edits: Sequence[LoopEdit] = (
 
 
 def georeference_if_possible(results: Results, survey: Survey | None, edits: Sequence[LoopEdit] = ()) -> Results:
-    """As `georeference`; where that fails, the results as they are, with the reason."""
+    """As `georeference`; if that fails, the results as they are, with the reason."""
     try:
         return results if survey is None else georeference(results, survey, edits)
     except HemislamError as error:
@@ -64,7 +64,7 @@ def georeference_if_possible(results: Results, survey: Survey | None, edits: Seq
 
 
 def bent(results: Results, fixes: Fixes, found: Alignment, overridden: Mapping[str, bool]) -> Results:
-    """As `georeference`, with fixes that lie on the results as `found`."""
+    """As `georeference`, by fixes that bend the map. found: their alignment with the map as it is."""
     loops = results.loops
     if loops is None or not loops.g2o:
         raise HemislamError(
@@ -82,19 +82,19 @@ def bent(results: Results, fixes: Fixes, found: Alignment, overridden: Mapping[s
 
 
 def fixes_of(recording: Path, gnss: Path | None, near_ns: int) -> tuple[Fixes, str]:
-    """Those of a file, or of the recording, and what their heights are above. near_ns: as `read_fixes`."""
+    """The fixes of a file, or of the recording, and what their heights are above. near_ns: as in `read_fixes`."""
     path = gnss or recording
     return _read(recording, gnss, near_ns, path.stat().st_mtime_ns if path.exists() else 0)
 
 
 @lru_cache(maxsize=2)
 def _read(recording: Path, gnss: Path | None, near_ns: int, changed_ns: int) -> tuple[Fixes, str]:
-    """A recording of an hour takes seconds to read, and every click asks for its fixes. changed_ns: of the file."""
+    """As `fixes_of`, cached: an hour's recording takes seconds to read, at every click. changed_ns: of the file."""
     return read_fixes(gnss, near_ns) if gnss is not None else (recorded_fixes(recording), ELLIPSOIDAL)
 
 
 def _by_points(results: Results, survey: Survey, overridden: Mapping[str, bool]) -> Alignment:
-    """By the control points that were picked on keyframes so far."""
+    """The alignment by the control points that were picked on keyframes so far."""
     table = control_table(survey.control)
     picked = {}
     for pick in survey.picks:

@@ -23,7 +23,7 @@ class Quiet:
 
 @dataclass(frozen=True, slots=True)
 class FeedInfo:
-    """What is known of a source beside its measurements.
+    """What is known about a source besides its measurements.
 
     Attributes:
         path: of the recording, or a name for a live source. start_ns: time of the first point; 0: unknown.
@@ -54,8 +54,8 @@ class Feed(Protocol):
     """A source of measurements in order of time. Subclass it: only `info` and `next` are required.
 
     Attributes:
-        repeatable: whether `go_to`, or another feed of the same source, gives the same measurements again: only then
-            can a session go back or be repeated from its file.
+        repeatable: whether `go_to`, or another feed of the same source, gives the same measurements again. Only then
+            can a session go back, or be repeated from its file.
     """
 
     repeatable: bool = False
@@ -76,24 +76,24 @@ class Feed(Protocol):
         return None
 
     def go_to(self, place: Any) -> None:
-        """Go on from a place, exactly as the feed did that was there."""
+        """Continue from a place, exactly as the feed did when it was there."""
         return
 
     def live_state(self) -> LiveState | None:
-        """How a live source is doing; None for others. Raises HemislamError: it has ended."""
+        """The state of a live source; None for others. Raises HemislamError: it has ended."""
         return None
 
     def close(self) -> None:
-        """Release what is held."""
+        """Release all resources."""
         return
 
 
 AHEAD = 4
-"""Measurements that are read ahead. They take a few MB each."""
+"""Number of measurements that are read ahead. Each takes a few MB."""
 
 
 class _Ahead(Iterator[Measurement | DroppedScan | None]):
-    """The same entries, then None, read by a thread."""
+    """The same entries, then None, read ahead by a thread."""
 
     def __init__(self, entries: Iterator[Measurement | DroppedScan]) -> None:
         self._entries = entries

@@ -1,4 +1,4 @@
-"""What the user makes beside the map and a session keeps: notes, views, measures, marks of the brush, the clip box."""
+"""What the user adds to the map and a session keeps: notes, views, measures, marks of the brush, the clip box."""
 
 from dataclasses import dataclass, fields
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from app.slam.ply import Keyframes
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A remark of the user, or what was done with forks."""
+    """A remark of the user, or a record of what was done with forks."""
 
     frame: int
     text: str
@@ -27,11 +27,11 @@ KeptView = tuple[Vector, Vector]
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """A place on what a keyframe saw, so that it moves with the map.
+    """A place relative to a keyframe, so that it moves with the map.
 
     Attributes:
-        at: (x, y, z), m, in the keyframe's IMU frame. frame: of the keyframe, since other settings make others; -1: not
-            known, as in older files.
+        at: (x, y, z), m, in the keyframe's IMU frame. frame: of the keyframe, since other settings choose other
+            keyframes; -1: unknown, as in older files.
     """
 
     keyframe: int
@@ -40,7 +40,7 @@ class Spot:
 
 
 def is_there(spot: Spot | Pick, keyframes: Keyframes) -> bool:
-    """Whether the keyframe that it was picked on is still there, and no other one in its place."""
+    """Whether the keyframe that it was picked on still exists and has not been replaced by another one."""
     return 0 <= spot.keyframe < len(keyframes) and spot.frame in (-1, keyframes[spot.keyframe].frame)
 
 
@@ -54,10 +54,10 @@ class Measure:
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """What of the map is shown, and what exports may be limited to.
+    """The part of the map that is shown, and that exports may be limited to.
 
     Attributes:
-        box: None: none was chosen yet. on: whether what is outside it is hidden.
+        box: None if none was chosen yet. on: whether points outside it are hidden.
         unrolled: the map is shown as a profile along the walked path. slab: m, how wide that is.
 
     Raises:
@@ -95,7 +95,7 @@ class Kept:
 
     Attributes:
         notes, views, measures, painted: in the order in which they were made. painted: points marked as ground or not.
-        clip: what of the map is shown.
+        clip: the part of the map that is shown.
     """
 
     notes: tuple[_Note, ...] = ()
@@ -105,7 +105,7 @@ class Kept:
     clip: Clip = WHOLE
 
     def kept(self) -> dict[str, Any]:
-        """All of it by name, of a value that may hold more."""
+        """The attributes of this class by name, of a value that may have more."""
         return {field.name: getattr(self, field.name) for field in fields(Kept)}
 
 

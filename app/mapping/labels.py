@@ -1,7 +1,7 @@
 """Labels of points as a layer over keyframes, which are immutable.
 
-The base is what the engine found. Over it lie the points that move (`app.mapping.moving`), and over these the user's
-edits as a list: the newest edit of a keyframe counts, and undo is a shorter list.
+The base layer holds the engine's labels. Over it lie the moving points (`app.mapping.moving`), and over these the
+user's edits as a list: the newest edit of a keyframe counts, and undo shortens the list.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ class LabelEdit:
 
     @classmethod
     def of(cls, keyframe: Keyframe, labels: U8 | Sequence[int] | int) -> "LabelEdit":
-        """Give a keyframe these labels, or all its points one. Raises HemislamError: there are more or fewer."""
+        """Give a keyframe these labels, or one label to all its points. Raises HemislamError: the number is wrong."""
         given, count = np.asarray(labels, np.uint8), len(keyframe.cloud)
         if given.shape not in ((), (count,)):
             raise HemislamError(f"Keyframe {keyframe.index} has {count:,} points; {given.size:,} labels do not fit.")
@@ -36,10 +36,10 @@ class LabelledKeyframes:
     """Keyframes with the labels of all layers.
 
     Args:
-        count: of keyframes, if no others are to be seen. moving: finds the points that move.
+        count: of keyframes, if later ones are to be ignored. moving: finds the points that move.
 
     Attributes:
-        edits: those in force, oldest first.
+        edits: the edits in force, oldest first.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class LabelledKeyframes:
             raise IndexError(f"keyframe {index} of {len(self)}")
         keyframe = self._keyframes[index]
         labels = next((edit.labels for edit in reversed(self.edits) if edit.keyframe == index), b"")
-        if len(labels) == len(keyframe.cloud):  # else there are none, or the engine's version kept other points then
+        if len(labels) == len(keyframe.cloud):  # else there are none, or an older engine version kept other points
             return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.frombuffer(labels, np.uint8)))
         if self._count is None:
             moves = self._moving.known(keyframe.index)
@@ -71,18 +71,18 @@ class LabelledKeyframes:
         return replace(keyframe, cloud=replace(keyframe.cloud, labels=np.where(moves, MOVING, keyframe.cloud.labels)))
 
     def now(self) -> "LabelledKeyframes":
-        """The present ones with their present labels, which do not change any more.
+        """The present keyframes with their present labels, frozen.
 
-        Which points move is found when a keyframe is read, if it is not known by then.
+        The moving points of a keyframe are found when it is read, if they are not known by then.
         """
         return LabelledKeyframes(self._keyframes, self._moving, self.edits, len(self))
 
     def find_moving(self, *, last: bool) -> tuple[int, bool] | None:
-        """As `MovingPoints.next`, for the keyframes that are there."""
+        """As `MovingPoints.next`, for the present keyframes."""
         return self._moving.next(len(self), last=last)
 
     def forget_after(self, count: int) -> None:
-        """All but the first `count` keyframes will be others."""
+        """All keyframes after the first `count` will be different ones."""
         self.edits = tuple(edit for edit in self.edits if edit.keyframe < count)
         self._moving.forget_after(count)
 
@@ -93,7 +93,7 @@ class LabelledKeyframes:
         self.edits = (*self.edits, LabelEdit.of(self._keyframes[keyframe], labels))
 
     def undo(self) -> KeyframeId:
-        """Take the newest edit back. Returns its keyframe. Raises HemislamError: there is none."""
+        """Undo the newest edit. Returns its keyframe. Raises HemislamError: there is none."""
         if not self.edits:
             raise HemislamError("There is no edit of labels to undo.")
         *rest, last = self.edits

@@ -23,14 +23,14 @@ from app.slam.types import DroppedScan, Measurement
 POLL_S = 0.02
 """How long to wait for the next scan before looking for commands."""
 EVERY = 10
-"""Frames between two checkpoints. The receiving process can give six seconds of scans again."""
+"""Frames between two checkpoints. The receiving process can send the last six seconds of scans again."""
 KEYFRAMES, HANDOVER = "keyframes", "handover.sqlite"
 
 log = logging.getLogger(__name__)
 
 
 class LiveFeed(Feed):
-    """Scans from a process that receives them. A place is the number of the newest scan, and when the first began."""
+    """Scans from a process that receives them. A place is the newest scan's number and the time of the first scan."""
 
     def __init__(self, client: LiveClient, name: Path) -> None:
         self._client = client
@@ -54,8 +54,8 @@ class LiveFeed(Feed):
         self._info = replace(self._info, start_ns=start_ns)
 
     def acknowledge(self) -> None:
-        """Scans up to here are not asked for again."""
-        with contextlib.suppress(HemislamError):  # the source has ended; the next scan that is asked for tells
+        """Tell the source that scans up to here will not be requested again."""
+        with contextlib.suppress(HemislamError):  # the source has ended; the next request reports that
             self._client.kept()
 
     def live_state(self) -> LiveState:
@@ -66,7 +66,7 @@ class LiveFeed(Feed):
 
 
 class LiveSession(Session):
-    """A session on a live source. It only goes on, and another process can take it over if this one dies.
+    """A session on a live source. It only goes forward, and another process can take it over if this one dies.
 
     Args:
         folder: for what must outlive the process.
@@ -84,7 +84,7 @@ class LiveSession(Session):
         super().__init__(feed, Engine(params, KeyframeStore(folder / KEYFRAMES)), loops=loops)
 
     def _remember(self, *, near: bool = False) -> None:
-        """Write what another process needs to go on from here. What is written must not grow with the session."""
+        """Write what another process needs to continue from here. Its size must not grow with the session."""
         if self.frame < 0 or self.frame % EVERY:
             return
         kept = (self.checkpoint(), self.params, self.history, self.edits, self.keyframes.edits, self.survey)
@@ -101,7 +101,7 @@ class LiveSession(Session):
             self._live.acknowledge()
 
     def take_over(self) -> bool:
-        """Go on where a process that died was. False if it left nothing to go on from."""
+        """Continue where a process died. False if it left nothing to continue from."""
         try:
             ((pickled,),) = self._file.execute("SELECT pickled FROM kept")
             checkpoint, params, history, edits, labels, survey = pickle.loads(pickled)
@@ -127,11 +127,11 @@ class LiveSession(Session):
 def open_live_session(
     address: LiveAddress, name: Path, params: Params, folder: Path, *, take_over: bool = False
 ) -> LiveSession:
-    """Map what comes from now on, or go on where a process that died was.
+    """Map scans from now on, or continue where a process died.
 
     Args:
         name: of the source, in place of a recording's path. folder: for what must outlive the process.
-        take_over: go on, if that is possible.
+        take_over: continue, if that is possible.
 
     Raises:
         HemislamError: the receiving process has ended.
@@ -146,7 +146,7 @@ def open_live_session(
     feed = LiveFeed(LiveClient(address), name)
     session = LiveSession(feed, params, folder)
     if take_over:
-        feed.go_to((0, 0))  # all that was given to the process that died before its first checkpoint
+        feed.go_to((0, 0))  # receive again all scans that the dead process had before its first checkpoint
     else:
         feed.acknowledge()  # scans of an earlier session
     return session

@@ -1,4 +1,4 @@
-"""The loop search in a process of its own, so that the frame loop never waits for it. One that dies is replaced."""
+"""The loop search in a process of its own, so that the frame loop never waits for it. If it dies, it is replaced."""
 
 import os
 from collections import deque
@@ -19,7 +19,7 @@ MOST_DEATHS: Final = 3
 """A worker is replaced this many times; after that, loops stay as they are."""
 GIVEN_UP: Final = "Loops are no longer looked for; restart to try again."
 MOST_PENDING: Final = 4
-"""Requests that a new worker is sent at a time, so that keyframes do not pile up in memory."""
+"""Most requests sent to a new worker at a time, so that keyframes do not pile up in memory."""
 
 
 class LoopProcess(Child):
@@ -34,7 +34,7 @@ class LoopProcess(Child):
         """The reply to the oldest request that has none yet; None if there is none within the time (s).
 
         Raises:
-            ChildDied: it will never come.
+            ChildDied: the reply will never come.
         """
         message: tuple[Reply, LoopChange | None] | None = super().receive(timeout)
         if message is None:
@@ -56,7 +56,7 @@ class RestartingLoops:
         self._unsent: deque[Ask] = deque()
         self._sent: deque[Ask | None] = deque()  # None: a keyframe
         self._limit, self._given_up = RestartLimit(MOST_DEATHS), False
-        self._lost = 0  # keyframes that the process before had been sent
+        self._lost = 0  # number of keyframes sent to the previous process
         self._alarms: list[str] = []
 
     def send(self, ask: Ask) -> None:
@@ -94,7 +94,7 @@ class RestartingLoops:
 
     @property
     def catching_up(self) -> bool:
-        """Whether a new process has yet to be sent what the one before had."""
+        """Whether a new process still lacks keyframes that the previous one had."""
         return bool(self._unsent) and self._follower.length < max(self._lost, self._log.stored)
 
     def _feed(self) -> None:
@@ -110,7 +110,7 @@ class RestartingLoops:
             self._process.send(keyframe or self._unsent.popleft())
 
     def _replace(self, error: ChildDied) -> None:
-        """Begin again with a new process: what was not answered is asked again."""
+        """Begin again with a new process, which gets all unanswered questions again."""
         self._given_up = not self._limit.allows()
         self._process.close()
         self._unsent.extendleft(reversed([ask for ask in self._sent if ask is not None]))

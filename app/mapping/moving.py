@@ -1,7 +1,7 @@
-"""The layer of moving points: which points of each keyframe are on what moves, found once and kept.
+"""The layer of moving points: which points of each keyframe are on moving objects, found once and kept.
 
-It follows from the keyframes around and from two parameters, so a session file does not hold it, and every way to the
-same keyframes gives the same points. The last ones are judged again as others follow.
+This layer depends only on the surrounding keyframes and on two parameters. So a session file does not hold it, and the
+same keyframes always give the same points. The last keyframes are judged again as others follow.
 """
 
 import threading
@@ -23,22 +23,22 @@ class MovingPoints:
 
     def __init__(self, keyframes: Keyframes, params: MovingParams) -> None:
         self._keyframes, self.params = keyframes, params
-        self._found: dict[int, tuple[int, int, bytes]] = {}  # points; keyframes that were there, or 0; packed mask
+        self._found: dict[int, tuple[int, int, bytes]] = {}  # points; number of keyframes then, or 0; packed mask
         self._sights: dict[int, moving.Sight] = {}
-        self._finished = 0  # so many of the first keyframes are found with all that are around them
+        self._finished = 0  # this many of the first keyframes were judged with all keyframes around them
         self._lock = threading.Lock()
 
     def choose(self, params: MovingParams) -> None:
-        """Find them by these from now on; what is known stays until then."""
+        """Use these parameters from now on; known masks stay until their keyframes are judged again."""
         if params != self.params:
             with self._lock:
                 self.params, self._finished = params, 0
                 self._found = {index: (points, 0, mask) for index, (points, _, mask) in self._found.items()}
 
     def forget_after(self, count: int) -> None:
-        """All but the first `count` keyframes will be others."""
+        """All keyframes after the first `count` will be different ones."""
         with self._lock:
-            whole = max(count - moving.AROUND, 0)  # so many of the first ones have all that are around them
+            whole = max(count - moving.AROUND, 0)  # this many of the first keyframes keep all keyframes around them
             self._finished = min(self._finished, whole)
             self._found = {
                 index: found for index, found in self._found.items() if index < whole or 0 < found[1] <= count
@@ -46,7 +46,7 @@ class MovingPoints:
             self._sights = {index: sight for index, sight in self._sights.items() if index < count}
 
     def known(self, index: int) -> Mask | None:
-        """(n,) as last found; None if that was never done."""
+        """(n,) the mask last found; None if there is none."""
         points, _, mask = self._found.get(index, (0, 0, b""))
         return np.unpackbits(np.frombuffer(mask, np.uint8), count=points).astype(np.bool_) if points else None
 
@@ -67,10 +67,10 @@ class MovingPoints:
             return mask
 
     def next(self, count: int, *, last: bool) -> tuple[int, bool] | None:
-        """Find those of one more keyframe. Returns its index and whether they changed; None: all are found.
+        """Find the moving points of one more keyframe. Returns its index and whether they changed; None: all are found.
 
         Args:
-            last: also of keyframes that others will follow.
+            last: include the last keyframes, to be judged again as others follow.
         """
         for index in range(self._finished, count):
             whole = index + moving.AROUND < count

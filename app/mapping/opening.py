@@ -29,8 +29,8 @@ def open_session(
     Args:
         truth: a trajectory (TUM) to compare with.
         loops: makes the client that looks for loops, if `loops.enabled`.
-        checkpoint_bytes: memory for checkpoints; None: the session only goes on.
-        read_ahead: as `FileFeed`.
+        checkpoint_bytes: memory for checkpoints; None: the session only goes forward.
+        read_ahead: as in `FileFeed`.
 
     Raises:
         HemislamError: the recording or the truth cannot be used.

@@ -1,7 +1,7 @@
-"""Points that a person marked as ground or not with the page's brush: the truth that ground labels are scored against.
+"""Points marked by a person as ground or not ground with the page's brush: the truth for scoring ground labels.
 
-Marks belong to frames by their stamp, so they outlive restarts and hold for any other run of the same recording.
-They are a list of strokes; a later one lies over those before, and undo is a shorter list.
+Marks belong to frames by their stamp, so they survive restarts and hold for any other run of the same recording.
+They are a list of strokes; a later stroke covers earlier ones, and undo shortens the list.
 """
 
 import json
@@ -49,7 +49,7 @@ class Stroke:
 def marks(strokes: Iterable[Stroke]) -> dict[int, U8]:
     """(n,) marks by the stamps of frames, in the order of stamps; frames without any mark are left out.
 
-    A stroke on a cloud of another size, as other limits of range leave it, starts the frame anew.
+    If a stroke was made on a cloud of another size, as other range limits give, the marks of this frame start anew.
     """
     found: dict[int, U8] = {}
     for stroke in strokes:
@@ -78,7 +78,7 @@ def entry_of(stroke: Stroke) -> dict[str, Any]:
 
 
 def stroke_of(entry: dict[str, Any]) -> Stroke:
-    """Raises KeyError, TypeError, ValueError, OverflowError or zlib.error: it is no stroke."""
+    """Raises KeyError, TypeError, ValueError, OverflowError or zlib.error: it is not a stroke."""
     count = int(entry["points"])
     packed = zlib.decompressobj().decompress(b64decode(entry["touched"]), max(count, 0) // 8 + 2)
     if len(packed) != -(-count // 8):
@@ -87,14 +87,14 @@ def stroke_of(entry: dict[str, Any]) -> Stroke:
 
 
 def to_json(strokes: Iterable[Stroke]) -> str:
-    """Marks as a file, `NAME.labels.json`, that can be read back and by others."""
+    """Marks as the text of a file, `NAME.labels.json`, for `read_json` and for other programs."""
     return (
         json.dumps({"hemislam_labels": 1, "strokes": list(map(entry_of, strokes_of(marks(strokes))))}, indent=1) + "\n"
     )
 
 
 def read_json(text: str, name: str) -> tuple[Stroke, ...]:
-    """The strokes of such a file. Raises HemislamError: it is none."""
+    """The strokes of such a file. Raises HemislamError: it is not one."""
     try:
         tree = json.loads(text)
         if tree["hemislam_labels"] != 1:

@@ -1,4 +1,4 @@
-"""Writes what came of a session: the files of a run, or those in other formats."""
+"""Writes the results of a session: the files of a run, or files in other formats."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ def write_all(
     *,
     replace: bool,
 ) -> dict[str, Any]:
-    """Write the results, georeferenced if that is possible; as `Session.save`."""
+    """Write the results, georeferenced if that is possible. Arguments as in `Session.save`."""
     if session is not None:
         mark(results, session.state)
     if survey is not None:

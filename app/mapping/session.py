@@ -1,4 +1,4 @@
-"""A session: a feed of measurements, the engine at work on it, loops, and the log of what came of it so far."""
+"""A session: a feed of measurements, the engine that processes them, loops, and the log of the frames so far."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -42,23 +42,23 @@ _NO_LOOPS = MapFrame()
 class Session:
     """One pass through a feed, frame by frame. `serve`, `run`, `replay` and `evaluate` all drive this.
 
-    After going back, the session knows the frames up to `known` until it goes on differently. A session that repeats a
-    file knows its frames up to `planned`.
+    After going back, the session knows the frames up to `known` until it continues differently. A session that repeats
+    a file knows its frames up to `planned`.
 
     Args:
-        loops: makes the client that looks for loops, `InlineLoops` for example; None: odometry alone.
-        truth: a trajectory (TUM) to compare with. checkpoints: to go back to; None: the session only goes on.
+        loops: makes the client that looks for loops, such as `InlineLoops`; None: odometry alone.
+        truth: a trajectory (TUM) to compare with. checkpoints: to go back to; None: the session only goes forward.
 
     Attributes:
-        frame: index of the newest frame, -1 before the first. result: of it; None before the first frame and right
-            after going back.
-        frames: all that are known, also those after `frame`. planned: the last frame of a session file, or -1.
-        heading: frames up to this one are repeated as they were, see `go_to`.
+        frame: index of the newest frame, -1 before the first. result: of this frame; None before the first frame and
+            right after going back.
+        frames: all known frames, including those after `frame`. planned: the last frame of a session file, or -1.
+        heading: frames up to this one are repeated as they were; see `go_to`.
         params: for frames not yet processed; set them with `choose`.
         history: parameters by the frame from which they apply, ascending.
-        ended: the feed has no more to give. keyframes: with all layers of labels.
+        ended: whether the feed is at its end. keyframes: with all layers of labels.
         calibration: what the recording shows about its sensors, in a sentence, for the report; "" if nothing.
-        survey: what the results are georeferenced by, or None. adjustment: of the map by that and by gravity.
+        survey: what georeferences the results, or None. adjustment: of the map, by the survey and by gravity.
 
     Raises:
         HemislamError: the truth cannot be read.
@@ -91,13 +91,13 @@ class Session:
         self._shown = _NO_LOOPS, _NO_LOOPS, _NO_LOOPS
         self.checkpoints = checkpoints
         self._waiting: Measurement | None = None
-        self._dropped: tuple[str, ...] = ()  # why scans since the newest frame were
+        self._dropped: tuple[str, ...] = ()  # why scans since the newest frame were dropped
         self._saves = ThreadPoolExecutor(max_workers=1, thread_name_prefix="save")
         self._remember()
 
     # --- going on --------------------------------------------------------------------------------
     def peek(self) -> Measurement | DroppedScan | Quiet | None:
-        """What `advance` will process; None at the end. Anything but a measurement is returned once.
+        """What `advance` will process; None at the end. Anything but a measurement is returned only once.
 
         Raises:
             HemislamError: the feed cannot be read any further.
@@ -116,10 +116,10 @@ class Session:
         return self._waiting
 
     def advance(self) -> StepResult | DroppedScan | Quiet | None:
-        """Process the next frame. Returns its result, or what `peek` gives if that is no measurement.
+        """Process the next frame. Returns its result, or what `peek` gives if that is not a measurement.
 
-        Frames that are repeated (`go_to`) use the parameters they had. A scan on which the engine fails is left out;
-        when it is repeated, a `DroppedScan` is returned.
+        Repeated frames (`go_to`) use the parameters that they had. A scan on which the engine fails is left out; when
+        the scan is repeated, a `DroppedScan` is returned.
 
         Raises:
             HemislamError: the feed cannot be read any further. Exception: the engine failed.
@@ -146,7 +146,7 @@ class Session:
         return result
 
     def _step(self, measurement: Measurement, frame: int, params: Params) -> StepResult:
-        """The engine's step, and the loops that come into effect before it."""
+        """Put due loops into effect, then do the engine's step."""
         begin = perf_counter()
         news = self.loops.due(frame) if self.loops else ()
         loops_s = perf_counter() - begin
@@ -168,7 +168,7 @@ class Session:
 
     @property
     def known(self) -> int:
-        """The last frame that was processed and still holds; -1 if there is none."""
+        """The last frame that was processed and is still valid; -1 if there is none."""
         return len(self.frames) - 1
 
     @property
@@ -183,12 +183,12 @@ class Session:
 
     @property
     def dropped(self) -> int:
-        """Scans dropped up to the newest frame, and since then."""
+        """Number of scans dropped up to the newest frame, and since then."""
         return sum(len(one.dropped) for one in self.frames[: self.frame + 1]) + len(self._dropped)
 
     @property
     def map_frame(self) -> MapFrame:
-        """Where odometry lies in the map by the loops, at the newest frame."""
+        """The transform from odometry to the map by the loops, at the newest frame."""
         return self.loops.frame if self.loops else _NO_LOOPS
 
     @property
@@ -200,7 +200,7 @@ class Session:
 
     # --- parameters and edits --------------------------------------------------------------------
     def choose(self, params: Params) -> None:
-        """Use these for all frames not yet processed, except those that take effect on restart."""
+        """Use these for all frames not yet processed, except parameters that take effect on restart."""
         waiting = [path for path in self.params.changed(params) if EFFECT[path] == "restart"]
         usable = params.with_values({path: self.params.value(path) for path in waiting})
         if usable != self.params:
@@ -211,7 +211,7 @@ class Session:
             self._moving.choose(usable.moving)
 
     def params_of(self, frame: int) -> Params | None:
-        """Those in force at a known or planned frame; of a later one, those of the last."""
+        """The parameters at a known or planned frame; for a later frame, those of the last of these."""
         return next((params for first, params in reversed(self.history) if first <= frame), None)
 
     def edit_loops(self, edits: tuple[LoopEdit, ...], undone: tuple[LoopEdit, ...] = ()) -> None:
@@ -231,12 +231,12 @@ class Session:
 
     @property
     def edits(self) -> Edits:
-        """Of loops, also those that are asked for and not in effect yet."""
+        """The edits of loops, including those that are requested but not yet in effect."""
         return self.loops.edits if self.loops else Edits()
 
     @property
     def opened(self) -> Opened:
-        """What a session file says of the feed."""
+        """What a session file says about the feed."""
         info = self.feed.info
         return Opened(info.path.resolve(), info.start_s, info.part_s, size_of(info.path))
 
@@ -248,8 +248,8 @@ class Session:
     def go_to(self, frame: int) -> None:
         """Head for a frame that is known or planned: `advance` repeats all frames up to it.
 
-        The session goes to the nearest checkpoint if that saves frames. Saves under way are finished first, since they
-        read keyframes that are about to be replaced.
+        The session goes to the nearest checkpoint if that saves frames. It first waits for saves in progress, since
+        these read keyframes that are about to be replaced.
 
         Raises:
             HemislamError: the feed cannot go back, or a checkpoint cannot be read; nothing has changed.
@@ -265,21 +265,21 @@ class Session:
         self.heading = heading
 
     def stay(self) -> None:
-        """Head for no frame any more: what comes next is processed with the present parameters."""
+        """Stop heading for a frame: the next frames are processed with the present parameters."""
         self.heading = self.frame
 
     @property
     def revisits(self) -> bool:
-        """Whether the next frame is one that was processed before and is taken as it was."""
+        """Whether the next frame was processed before and is repeated as it was."""
         return self.frame < min(self.heading, self.known)
 
     def checkpoint(self) -> Checkpoint:
-        """The present state. Call it between two frames, with nothing peeked at."""
+        """The present state. Call this between two frames, not after `peek`."""
         assert self._waiting is None
         return Checkpoint(self.frame, self.engine.checkpoint(), self.feed.place())
 
     def return_to(self, checkpoint: Checkpoint) -> None:
-        """Be where a checkpoint of this session was taken."""
+        """Go to the state of a checkpoint of this session."""
         self.feed.go_to(checkpoint.place)
         self.engine.restore(checkpoint.engine)
         self.engine.params = self.params
@@ -289,7 +289,7 @@ class Session:
         self._waiting, self._dropped, self.ended = None, (), False
 
     def _forget_after(self, frame: int) -> None:
-        """What comes after a frame will be different."""
+        """Forget the frames after this one; different ones will follow."""
         self.frames.truncate(frame + 1)
         count = sum(one.keyframe for one in self.frames)
         self.keyframes.forget_after(count)
@@ -304,10 +304,10 @@ class Session:
         if self.checkpoints and self.checkpoints.wanted(self.frame, near=near):
             self.checkpoints.add(self.frame, self.checkpoint())
 
-    # --- what came of it -------------------------------------------------------------------------
+    # --- results ---------------------------------------------------------------------------------
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is unusual about the feed and the truth."""
+        """Findings on the feed and the truth."""
         info, truth = self.feed.info, self.truth
         if truth is None or info.duration_s is None:
             return info.findings
@@ -336,7 +336,7 @@ class Session:
         return compared(self.truth.stamps_ns, self.truth.positions, ours.stamps_ns, ours.positions)[1]
 
     def results(self, stopped: str = "") -> Results:
-        """What result files are written from: the frames so far, with all loops, in effect or not. As `save`."""
+        """The input of result files: the frames so far, with all loops, in effect or not. stopped: as in `save`."""
         info = self.feed.info
         made_from = RunInfo(
             info.path, self.params, info.start_s, info.part_s, self.truth, self.truth_path, stopped, self.calibration
@@ -358,11 +358,11 @@ class Session:
         replace: bool = True,
         stopped: str = "",
     ) -> "Future[dict[str, Any]]":
-        """Write the results of the frames so far in a thread of its own, with all loops, in effect or not.
+        """Write the results of the frames so far in a separate thread, with all loops, whether in effect or not.
 
         Args:
             session: to be written beside the files of a run. formats: of `EXPORTS`, instead of the files of a run.
-            choice: of points. progress: called with the share that is written, 0-1, in that thread.
+            choice: of points. progress: called in that thread with the share that is written, 0-1.
             replace: overwrite older results. stopped: why the session ended early, if it did.
 
         Returns:
@@ -375,22 +375,22 @@ class Session:
         )
 
     def levelling(self, frame: MapFrame) -> MapFrame:
-        """What levels the map by gravity, which is known better now than at the start."""
+        """The rotation that levels the map by gravity, which is known better now than at the start."""
         return MapFrame.levelling(frame.newest[:3, :3] @ self.engine.g_odom)
 
     def georeference(self) -> "Future[Results]":
-        """Find where the map as it is now lies by the survey, in a thread of its own; as `earth.georeference`."""
+        """Georeference the present map by the survey, in a separate thread; see `earth.georeference`."""
         from app.mapping.earth import georeference
 
         assert self.survey is not None
         return self._saves.submit(georeference, self.results(), self.survey, self.edits.done)
 
     def finish_saves(self) -> None:
-        """Wait until no save is under way."""
-        self._saves.submit(lambda: None).result()  # they are done one after the other
+        """Wait until no save is in progress."""
+        self._saves.submit(lambda: None).result()  # saves run one after the other
 
     def close(self) -> None:
-        """Finish the saves and release what is held."""
+        """Finish the saves and release all resources."""
         self._saves.shutdown()
         self.feed.close()
         if self.loops:

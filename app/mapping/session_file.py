@@ -1,7 +1,7 @@
-"""Session files: what was opened, and everything that the present state follows from.
+"""Session files: what was opened, and everything that determines the present state.
 
-Lines of JSON are only appended, so a file that was cut anywhere holds the session up to its last whole line. The engine
-is deterministic: the recording, the parameters by frame, the loop edits and the newest frame are all that is needed.
+Lines of JSON are only appended, so a truncated file still holds the session up to its last complete line. The engine is
+deterministic: the recording, the parameters by frame, the loop edits and the newest frame are all that is needed.
 
     {"hemislam": "0.3.0", "format": 2, "recording": "/data/walk.mcap", ...}    what was opened
     {"frame": 120, "state": {...}}                                             all of the state, where it changed
@@ -51,18 +51,18 @@ log = logging.getLogger(__name__)
 
 SUFFIX = ".hemislam"
 FORKS, FORK_START = "forks", f"start{SUFFIX}"
-"""Below the folder of session files, folders of forks; and in each the file that the fork began with."""
+"""Subfolder of the folder of session files that holds the folders of forks, and the file that each fork began with."""
 FORMAT = 2
 MOST_POINTS = 1 << 24
-"""Of a keyframe: far more than any scan has."""
+"""Most points of a keyframe: far more than any scan has."""
 
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """What a session was opened on.
+    """The recording that a session was opened on.
 
     Attributes:
-        recording: its file or folder. start_s, duration_s: the part of it. nbytes: its size, to recognise it.
+        recording: file or folder. start_s, duration_s: the part that was opened. nbytes: its size, to recognise it.
     """
 
     recording: Path
@@ -80,7 +80,7 @@ _Edits = Annotated[
 
 
 def _unpacked(labels: str) -> bytes:
-    """Labels of a keyframe, of which there are not more than points."""
+    """The labels of a keyframe; their number is limited, so that a damaged file cannot fill the memory."""
     packed = zlib.decompressobj()
     unpacked = packed.decompress(b64decode(labels), MOST_POINTS)
     if packed.unconsumed_tail:
@@ -103,7 +103,7 @@ Speed = Annotated[
     PlainSerializer(lambda speed: "max" if math.isinf(speed) else speed, when_used="json"),
     WithJsonSchema({"anyOf": [{"type": "number", "minimum": 0.1}, {"const": "max"}]}),
 ]
-"""Times real time; inf is `max` in JSON."""
+"""Playing speed in multiples of real time; inf is `max` in JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,14 +133,14 @@ _SHOWN: Mapping[str, tuple[str, TypeAdapter[Any]]] = {
     "views": ("kept views", TypeAdapter(tuple[KeptView, ...])),
     "measures": ("measures", TypeAdapter(tuple[Measure, ...])),
 }
-"""Parts of a state that decide no result, and their names."""
+"""Parts of a state that do not affect results, and their names."""
 
 
 @dataclass(frozen=True, slots=True)
 class SavedSession:
-    """What a session file holds. frame: where it is, -1 before the first. ended: the recording had ended, so that loops
-    were searched at the last keyframes too. known: the last frame that holds, `frame` or one that it went back from.
-    left_out: what of the file could not be read, in a sentence; "" if all could.
+    """What a session file holds. frame: the newest, -1 before the first. ended: whether the recording had ended, so
+    that loops were searched at the last keyframes too. known: the last valid frame: `frame`, or a later one before
+    going back. left_out: which parts of the file could not be read, in a sentence; "" if none.
     """
 
     opened: Opened
@@ -155,11 +155,11 @@ class SavedSession:
 
     @property
     def first_params(self) -> Params:
-        """Those that the first frame was processed with."""
+        """The parameters with which the first frame was processed."""
         return self.state.history[0][1] if self.state.history else self.state.params
 
     def forked(self, frame: int, params: Params) -> "SavedSession":
-        """The session that was the same up to this frame, and goes on with these parameters."""
+        """A session that is the same up to this frame and continues with these parameters."""
         history = tuple(entry for entry in self.state.history if entry[0] <= frame)
         notes = tuple(note for note in self.state.notes if note.frame <= frame)
         state = replace(self.state, params=params, history=history, notes=notes)
@@ -168,7 +168,7 @@ class SavedSession:
 
 
 class SessionWriter:
-    """Writes a session file while the session goes on. A disk that fails ends the file, not the session.
+    """Writes a session file while the session runs. If the disk fails, the file ends, but the session goes on.
 
     Args:
         path, opened: None: nothing is written.
@@ -187,13 +187,13 @@ class SessionWriter:
             return
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("x", encoding="utf-8", errors="backslashreplace")  # a path may be no UTF-8
+            self._file = path.open("x", encoding="utf-8", errors="backslashreplace")  # a path need not be UTF-8
         except OSError as error:
             self._failed(error)
         self._line(_head(opened))
 
     def write(self, frame: int, state: State, *, ended: bool = False, known: int = -1) -> None:
-        """Write where the session is, and its state, if they have changed. As in `SavedSession`."""
+        """Write the session's frame and state, if they have changed. Arguments as in `SavedSession`."""
         at = frame, ended, max(frame, known)
         if state != self._state:
             self._line(_entry(*at, state))
@@ -211,7 +211,7 @@ class SessionWriter:
             return
         try:
             self._file.write(json.dumps(entry, ensure_ascii=False) + "\n")
-            self._file.flush()  # a process that is killed loses nothing of it then
+            self._file.flush()  # so that nothing is lost if the process is killed
         except OSError as error:
             self._failed(error)
 
@@ -220,13 +220,13 @@ class SessionWriter:
             f"The session file {self.path} cannot be written ({error.strerror}); changes from now on are not saved."
         )
         log.warning(self.error)
-        with contextlib.suppress(OSError):  # the rest of the line is given up
+        with contextlib.suppress(OSError):  # the rest of the line is lost
             self.close()
         self._file = None
 
 
 def new_path(folder: Path, recording: Path) -> Path:
-    """A name for the session file of a recording, in the order of time."""
+    """A free name for the session file of a recording; names sort by time."""
     return free_path(folder / f"{shortened(recording.stem)}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
 
 
@@ -252,7 +252,7 @@ def read_session(path: Path) -> SavedSession:
         try:
             entries.append(json.loads(line))
         except (ValueError, RecursionError):
-            break  # cut by a crash; what comes after it cannot be trusted
+            break  # cut by a crash; later lines cannot be trusted
     if not entries or not isinstance(entries[0], dict) or "hemislam" not in entries[0]:
         raise HemislamError(f"{path} is not a session of hemislam; open one that the workbench has written.")
     head = entries[0]
@@ -283,7 +283,7 @@ def read_session(path: Path) -> SavedSession:
 
 
 def _state_of(entry: Mapping[str, Any]) -> tuple[State, str]:
-    """The state in a line, and what was left out of it, as in `SavedSession`: what is only shown and cannot be."""
+    """The state in a line, and `left_out` as in `SavedSession`: unreadable parts that are only shown."""
     entry, left_out = dict(entry), []
     for name, (what, adapter) in _SHOWN.items():
         try:
@@ -320,11 +320,11 @@ def read_marks(path: Path) -> tuple[tuple[int, bytes], ...]:
 
 
 def session_files(folder: Path) -> list[Path]:
-    """Those in a folder and of its forks, the newest first."""
+    """The session files in a folder and of its forks, the newest first."""
     found = []
     of_forks = (path for path in folder.glob(f"{FORKS}/*/*{SUFFIX}") if path.name != FORK_START)
     for path in (*folder.glob(f"*{SUFFIX}"), *of_forks):
-        with contextlib.suppress(OSError):  # it has gone meanwhile
+        with contextlib.suppress(OSError):  # it was deleted meanwhile
             found.append((path.stat().st_mtime_ns, path))
     return [path for _, path in sorted(found, reverse=True)]
 
@@ -349,7 +349,7 @@ def _head(opened: Opened) -> dict[str, Any]:
 
 
 def _entry(frame: int, ended: bool, known: int, state: State | None = None) -> dict[str, Any]:
-    """Where the session is, and its state if that has changed."""
+    """The line for the session's frame, and for its state if that has changed."""
     entry: dict[str, Any] = {"frame": frame} | ({"known": known} if known > frame else {})
     entry |= {"ended": True} if ended else {}
     return entry if state is None else entry | {"state": _STATE.dump_python(state, mode="json")}

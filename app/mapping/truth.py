@@ -1,4 +1,4 @@
-"""The error of a trajectory to another one of the same session, such as the truth."""
+"""The distance of a trajectory from another one of the same walk, such as the truth."""
 
 from contextlib import suppress
 
@@ -10,7 +10,7 @@ from app.slam.metrics import places_at, umeyama
 from app.slam.types import F64, I64
 
 LEAST_EXTENT_M = 0.5
-"""The truth is aligned once the trajectory spans this much. Before that, any noise would fit."""
+"""m: the truth is aligned once the trajectory spans this much. On a shorter one, noise would decide the alignment."""
 
 
 def compared(truth_stamps_ns: I64, truth_positions: F64, stamps_ns: I64, positions: F64) -> tuple[F64 | None, F64]:

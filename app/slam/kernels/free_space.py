@@ -14,8 +14,7 @@ from app.slam.kernels.clouds import PRIME_X, PRIME_Y, PRIME_Z
 NEAR, FAR = 0, 1
 """Layers of an image: the least and the greatest range in a bin, m; inf and 0 where nothing returned."""
 RING = 2
-"""A place is seen through only if nothing is in front of it in this many bins to each side: scan lines lie so far apart.
-"""
+"""A place is seen through only if nothing is before it in this many bins to each side, as far as lines are apart."""
 
 
 @njit(cache=True, inline="always")

@@ -68,7 +68,7 @@ class Search:
 
     @property
     def measured(self) -> Sequence[Measured]:
-        """Measurements of the first `len` keyframes. At a detected slip, odometry is weak, so that the graph can bend."""
+        """Measurements of the first `len` keyframes. At a detected slip, odometry is weak, so the graph can bend."""
         seen = len(self) - slips.REACH
         return [self._loose.get(k, one) if k <= seen else one for k, one in enumerate(self._measured[: len(self)])]
 
