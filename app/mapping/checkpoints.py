@@ -20,7 +20,7 @@ EVERY = 10
 NEAR = 24
 """Each of this many frames before the target of a seek gets a checkpoint, so that stepping back is immediate."""
 DENSE = 16_000
-"""Up to this many frames from the present, checkpoints are `EVERY` frames apart; at twice the distance, twice as far."""
+"""Up to this many frames from the present, checkpoints are `EVERY` frames apart; at twice the distance, twice that."""
 DISK_SHARE = 4
 """Disk space for checkpoints, in multiples of the memory; beyond it they become sparser."""
 START = -1

@@ -11,10 +11,10 @@ _SLACK = np.radians(10.0)
 """The azimuth may step back by this much (noise, horizontal calibration) without counting as a full turn."""
 
 _SMALL_STEP = np.radians(60.0)
-"""Steps below this lead from one firing to the next, not across firings without a return."""
+"""A step below this leads from one firing to the next; a larger one skips firings without a return."""
 
 _FIXED = np.radians(0.7)
-"""Clouds that begin within this of each other are cut at a fixed azimuth."""
+"""If clouds begin within this angle of each other, the driver cuts them at a fixed azimuth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +24,9 @@ class Spin:
     Attributes:
         period_s: of one revolution. clockwise: seen from +z (RoboSense) or not.
         ordered: whether the points of one ring come in firing order in the message.
-        start: (rings,) rad, azimuth at which each ring's revolution begins (they differ by the
-            channels' horizontal calibration), in the sense of rotation; None: each cloud begins at
-            another azimuth, that of its first point.
+        start: (rings,) rad, azimuth at which each ring's revolution begins, in the sense of rotation
+            (rings differ by the channels' horizontal calibration); None: each cloud begins at an
+            azimuth of its own, that of its first point.
     """
 
     period_s: float
@@ -35,7 +35,7 @@ class Spin:
     start: tuple[float, ...] | None
 
     def times_ns(self, points: F32, ring: U16) -> I64:
-        """(n,) int64 ns after the revolution's begin, of (n, 3) points on rings (n,)."""
+        """(n,) int64 ns after the revolution's start, of (n, 3) points on rings (n,)."""
         azimuth = turned_azimuth(points, self.clockwise)
         if self.start is None:
             from_start = _centred(azimuth - azimuth[0])
@@ -98,10 +98,10 @@ def sense_of_rotation(points: F32, ring: U16) -> tuple[bool, float]:
 
 
 def share_of_turn(firsts: F32, clockwise: bool, turns: float) -> float:
-    """Share of a turn that each message holds; 1 unless each begins where the one before ends.
+    """Share of a turn that each message holds; 1 unless each begins where the previous one ends.
 
     Args:
-        firsts: (n, 3) first point of each of n successive messages. turns: that one of them makes.
+        firsts: (n, 3) first point of each of n successive messages. turns: number of turns in one message.
     """
     steps = np.mod(np.diff(turned_azimuth(firsts, clockwise)), 2 * np.pi) / (2 * np.pi)
     share = float(np.median(steps)) if len(steps) else 1.0
@@ -122,8 +122,8 @@ def _along_rings(azimuth: F64, ring: U16) -> tuple[npt.NDArray[np.intp], npt.NDA
     """The angle by which the sensor has turned, summed along each ring in the order of the message, only forward.
 
     So a ring that sees nothing for half a turn is still placed correctly, and the last points of a revolution do not
-    become its first. Returns the points' order by ring, where each ring begins in it, and the angle at each of these
-    ordered points (it goes on from ring to ring).
+    become its first. Returns the points' order by ring, the index in it at which each ring begins, and the angle at
+    each of these ordered points (the sum continues from ring to ring).
     """
     order = np.argsort(ring, kind="stable")
     lines, sorted_azimuth = ring[order], azimuth[order]
@@ -134,7 +134,7 @@ def _along_rings(azimuth: F64, ring: U16) -> tuple[npt.NDArray[np.intp], npt.NDA
 
 
 def _forward(angle: F64) -> F64:
-    """Wrapped to [-slack, 360 deg - slack): a forward angle, but for noise."""
+    """Wrapped to [-slack, 360 deg - slack): a forward angle, except for noise."""
     wrapped: F64 = np.mod(angle + _SLACK, 2 * np.pi) - _SLACK
     return wrapped
 

@@ -8,7 +8,7 @@ from app.sensors.findings import Finding
 from app.slam.types import I64, Scan
 
 TOLERANCE_S = 0.15
-"""Drivers log a scan up to this late; a smaller difference is delay, not another clock."""
+"""Drivers may log a scan this late; a smaller difference is a delay, not a different clock."""
 OVERLAP, LEAST_OVERLAPS = 0.2, 0.4
 """Two scans overlap if they share more than 20 % of their duration; if over 40 % of neighbouring scans do, two LiDARs
 send on the topic."""
@@ -46,12 +46,12 @@ def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
 
 
 def is_copy(scan: Scan, before: Scan | None) -> bool:
-    """Whether a scan is the one before it once more: some recorders write a message twice."""
+    """Whether a scan repeats the previous one: some recorders write a message twice."""
     return before is not None and scan.stamp_ns == before.stamp_ns and np.array_equal(scan.points, before.points)
 
 
 def overlap_finding(scans: I64, topic: str) -> list[Finding]:
-    """Whether the scans of a topic overlap in time, as those of a single LiDAR cannot. scans: as above."""
+    """Whether the scans of a topic overlap in time, which scans of a single LiDAR cannot. scans: as above."""
     begin, end = scans[np.lexsort((scans[:, 2], scans[:, 1])), 1:].T
     overlaps = end[:-1] - begin[1:] > OVERLAP * np.median(end - begin)
     if not len(overlaps) or overlaps.mean() < LEAST_OVERLAPS:
@@ -61,7 +61,7 @@ def overlap_finding(scans: I64, topic: str) -> list[Finding]:
 
 
 def _offset_s(scans: I64, imu: I64) -> float:
-    """Seconds by which the IMU's stamps lag behind the LiDAR's, if everything was logged without delay."""
+    """Seconds by which the IMU's stamps lag behind the LiDAR's, assuming that logging has no delay."""
     scan_delay, imu_delay = (np.median((times[:, 0] - times[:, -1]).astype(np.float64)) for times in (scans, imu))
     return float(imu_delay - scan_delay) / 1e9
 

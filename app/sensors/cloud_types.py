@@ -20,16 +20,16 @@ from app.slam.types import F32, U8
 Column = npt.NDArray[Any]
 
 FARTHEST_M = 10_000.0
-"""On one axis; no LiDAR sees farther."""
+"""m on one axis; no LiDAR sees farther."""
 LATEST = 1e19
-"""Of a point's time in any unit: years in ns. Beyond it integers overflow."""
+"""Largest time of a point, in any unit: years in ns. Beyond it, integers overflow."""
 
 _LIVOX = {"tag", "line"}
 """Fields of clouds of the Livox drivers, as `CustomMsg` and as PointCloud2."""
 
 
 class CloudError(ValueError):
-    """One point-cloud message cannot be read; the text says why, fit for `DroppedScan.reason`."""
+    """One point-cloud message cannot be read; the text gives the reason, as for `DroppedScan.reason`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,19 +67,19 @@ class CloudMessage:
         return view.reshape(-1).astype(dtype.newbyteorder("="), copy=False)
 
     def xyz(self) -> F32:
-        """(n, 3) float32 m, as stored: NaN and zeros included. Returns that a Livox doubts are zeros, too."""
+        """(n, 3) float32 m, as stored, including NaN and zeros. Returns of low confidence of a Livox become zeros."""
         points = self._stored_xyz()
         if self.fields.keys() >= _LIVOX and (tag := self.column("tag")).dtype == np.uint8:
             points[(tag & DOUBTFUL) != 0] = 0.0
         return points
 
     def _stored_xyz(self) -> F32:
-        """A copy."""
+        """(n, 3) float32 m as stored, copied."""
         offsets = [self.fields.get(name, (-1, np.dtype("V1"))) for name in "xyz"]
         first, dtype = offsets[0]
         if dtype == np.dtype("<f4") and len(self) and offsets == [(first + 4 * i, dtype) for i in range(3)]:
             view = np.ndarray((self.height, self.width), "V12", self.data.data, first, (self.row_step, self.point_step))
-            return view.flatten().view(dtype).reshape(-1, 3)  # each point at once: packed numbers are slow to read
+            return view.flatten().view(dtype).reshape(-1, 3)  # a whole point at a time: packed numbers are slow to read
         return np.stack([self.column(name).astype(np.float32) for name in "xyz"], axis=1)
 
 
@@ -88,8 +88,8 @@ class CloudType:
     """One type of point-cloud message, and the names that its writers usually give to fields.
 
     Attributes:
-        name: as in ROS 2; the type of ROS 1 with the same name is read as well.
-        read: of a deserialised message. Raises CloudError if its content contradicts itself.
+        name: as in ROS 2; the ROS 1 type with the same name is read as well.
+        read: reads a deserialised message. Raises CloudError if its content contradicts itself.
         times, rings, intensities: lower-case names of fields, the most usual first.
         time_unit: of the points' times where the type fixes it; "auto" where it is judged by the data.
     """
@@ -131,7 +131,7 @@ def read_point_cloud_2(message: Any) -> CloudMessage:
 
 
 def _in_true_byte_order(cloud: CloudMessage) -> CloudMessage:
-    """The same, in the other byte order if coordinates are lengths in that one only: some drivers state it wrongly."""
+    """The same, in the other byte order if only that gives plausible coordinates: some drivers state it wrongly."""
     if not {"x", "y", "z"} <= cloud.fields.keys() or _share_of_lengths(cloud) > 0.5:
         return cloud
     fields = {name: (offset, dtype.newbyteorder()) for name, (offset, dtype) in cloud.fields.items()}
@@ -175,7 +175,7 @@ CLOUD_TYPES: dict[str, CloudType] = {kind.name: kind for kind in (POINT_CLOUD_2,
 
 @dataclass(frozen=True)
 class Probe:
-    """One of the first clouds of a topic, from which is decided how all of them are read.
+    """One of the first clouds of a topic, which determine how all of its clouds are read.
 
     Attributes:
         log_ns: when it was logged. cloud: its content.
@@ -199,7 +199,7 @@ class Probe:
 
     @property
     def index(self) -> npt.NDArray[np.intp]:
-        """(n,) places of the valid points in the message."""
+        """(n,) indices of the valid points in the message."""
         return self._valid[1]
 
     def column(self, name: str) -> Column:
@@ -215,9 +215,9 @@ def stamped(probes: list[Probe]) -> list[Probe]:
 
 
 def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray[np.intp], int]:
-    """Points that can be a return (nearer than `FARTHEST_M`, with a time), their indices, and how many others cannot.
+    """Points that can be a return (nearer than `FARTHEST_M`, with a time), their indices, and the number of others.
 
-    Points that are NaN or all zero are not counted: drivers put them where nothing came back.
+    Points that are NaN or all zero are not counted: drivers write them for beams without a return.
     """
     x, y, z = xyz.T
     farthest = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z))  # NaN if any of them is
@@ -229,5 +229,5 @@ def valid_points(xyz: F32, time: Column | None = None) -> tuple[F32, npt.NDArray
 
 
 def values_at(column: Column, index: npt.NDArray[np.intp]) -> Column:
-    """The values at these places, ascending and each once; the column itself if it has no others."""
+    """The values at these ascending, unique indices; the column itself if they are all of its rows."""
     return column if len(index) == len(column) else column.take(index, axis=0)

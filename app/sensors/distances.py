@@ -1,4 +1,4 @@
-"""Whether the points of a recording are as far as a LiDAR measures: in metres, and none where nothing came back."""
+"""Whether a recording's distances are plausible: in metres, and without values that stand for missing returns."""
 
 import math
 
@@ -9,9 +9,9 @@ from app.slam.sections import SensorParams
 from app.slam.types import F64, U16, Scan
 
 NEAREST_M, USUAL_M = 10.0, 100.0
-"""A walk has points nearer than the one, and most of them are nearer than the other."""
+"""m: on a walk, some points are nearer than the first, and most are nearer than the second."""
 SAME_M, SAME_SHARE, SAME_LINES = 0.001, 0.05, 3
-"""So many points, on so many lines, are never equally far; on one line they are, where the floor is level."""
+"""Real points are never equally far in such numbers on this many lines; on one line they may be, on a level floor."""
 
 
 def distance_findings(scans: list[Scan], params: SensorParams) -> list[Finding]:

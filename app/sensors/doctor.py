@@ -1,6 +1,7 @@
 """The recording doctor: what a recording holds, what was corrected, and what only the user can settle.
 
-Opening a recording already examines its first messages (`Recording.findings`); `examine` adds what takes a full pass.
+Opening a recording already examines its first messages (`Recording.findings`); `examine` adds findings that need a full
+pass.
 """
 
 from collections import Counter
@@ -29,9 +30,9 @@ from app.slam.types import F64, I64, DroppedScan, Scan, Vector
 MOST_IN_BATCH = 50
 """Samples that are read at a time."""
 MOST_BEHIND = 20
-"""Samples that may be left out because their stamps step back: a tenth of a second, over which the filter coasts."""
+"""Samples that may be left out because their stamps step back: a tenth of a second, which the filter can bridge."""
 DAMAGE = "file"
-"""Subject of what is wrong with the file itself."""
+"""Subject of findings about the file itself."""
 
 
 def examine(
@@ -94,8 +95,8 @@ class _Census:
     """What a full pass counts; only the times of each message are kept.
 
     Attributes:
-        scan_times: log time, begin and end of each scan, ns. imu_times: log time and stamp of each sample.
-        places: points that the messages have room for. nan, returns: how many of them are.
+        scan_times: log time, start and end of each scan, ns. imu_times: log time and stamp of each sample.
+        places: points that the messages have room for. nan, returns: how many of these are NaN, or returns.
         refused: points that cannot be returns. copies: scans that came twice. reasons: why scans are left out.
     """
 
@@ -114,7 +115,7 @@ class _Census:
     def add(self, entry: ScanEntry | ImuEntry | OtherEntry) -> None:
         if isinstance(entry, ImuEntry):
             sample = (entry.stamp_ns, entry.gyro, entry.accel)
-            if sample != self.last_sample:  # one that came twice says nothing of the rate
+            if sample != self.last_sample:  # a repeated sample says nothing about the rate
                 self.imu_times.append((entry.log_ns, entry.stamp_ns))
             self.last_sample = sample
             self.sequencer.add_imu(entry.stamp_ns, entry.gyro, entry.accel)
@@ -134,7 +135,7 @@ class _Census:
         self.take(last=False)
 
     def take(self, *, last: bool) -> None:
-        """Count what pairing gives."""
+        """Count the results of pairing."""
         paired = self.sequencer.finish() if last else self.sequencer.ready()
         self.reasons.update(entry.reason for entry in paired if isinstance(entry, DroppedScan))
 
@@ -184,7 +185,7 @@ def _rate(subject: str, stamps: I64, least: float) -> Finding:
 
 
 def _pauses(scans: I64, imu: I64) -> F64:
-    """(m, 2) s, when each time without scans and IMU samples begins, from the first scan on, and how long it lasts."""
+    """(m, 2) s, start (after the first scan) and duration of each pause, without scans and IMU samples."""
     if not len(scans):
         return np.empty((0, 2))
     begin, end = scans[:, 1].min(), scans[:, 2].max()
@@ -267,7 +268,7 @@ def _scan_time(scans: I64, copies: int) -> list[Finding]:
 
 
 def _mixed(scans: I64, imu: I64) -> list[Finding]:
-    """Whether twice as many scans and samples as usual come for a second: two parts of the walk, sorted by log time."""
+    """Whether twice as many scans and samples as usual come for a second: two parts of a walk, mixed by log time."""
     if not len(scans) or not len(imu):
         return []
     begin_ns, half_ns = min(int(scans.min()), int(imu.min())), 500_000_000

@@ -1,4 +1,4 @@
-"""One line of the recording doctor, as both opening and examining a recording produce it."""
+"""One line of the recording doctor. Both opening and examining a recording produce such lines."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,8 +13,8 @@ class Finding:
     Attributes:
         subject: what was examined, e.g. "point time". verdict: see `FindingVerdict`.
         text: what was found and how it was decided, in one sentence with units.
-        option: if the verdict is "needs you", what settles it, e.g. "--set recording.time_field=none"; otherwise what
-            to set in case the finding is wrong. "" if there is nothing to set.
+        option: if the verdict is "needs you", the option that settles it, e.g. "--set recording.time_field=none";
+            otherwise the option to set in case the finding is wrong. "" if there is nothing to set.
     """
 
     subject: str
@@ -29,7 +29,7 @@ class Finding:
 
     @property
     def spoken(self) -> str:
-        """Text and option, for readers of the page too, who have no command line before them."""
+        """Text and option, also for readers of the page, who may not see a command line."""
         if not self.option:
             return self.text
         settle = f"start hemislam with {self.option}"
@@ -37,6 +37,6 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """For a notification on the page, which has the options under Recording."""
+        """The text for a notification on the page, where the options are under Recording."""
         said = f"{self.subject[:1].upper()}{self.subject[1:]}: {self.text.rstrip('.')}."
         return f"{said} Settle it under Recording." if self.option else said

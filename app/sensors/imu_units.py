@@ -1,7 +1,7 @@
 """The units and axes of an IMU, settled from its first samples, and what is wrong with them.
 
-Gravity gives the accelerometer's unit. While the device sways, the direction of gravity turns in the IMU frame as the
-gyroscope says, if its unit is rad/s and both sensors have the same axes: this tests both.
+Gravity gives the accelerometer's unit. While the device sways, the direction of gravity turns in the IMU frame. This
+matches the gyroscope only if its unit is rad/s and both sensors have the same axes, so it tests both.
 """
 
 from dataclasses import dataclass
@@ -25,14 +25,14 @@ GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 _GYROSCOPE_OPTION = "--set recording.gyroscope_unit="
 
 MOST_ACCEL = 200.0
-"""m/s^2; a larger value is no walking motion."""
+"""m/s^2; a larger value is not a walking motion."""
 WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
-"""Accelerations are averaged over a window, about a step of walking, and compared with those one span later."""
+"""s: accelerations are averaged over a window, about a walking step, and compared with those one span later."""
 GAP_NS = 1_000_000_000
 DOUBTFUL, TOO_FAST = 3.0, 10.0
 """rad/s: a gyroscope that reads more than the first may be in deg/s; no hand turns faster than the second."""
 CLEARLY = 0.5
-"""Another unit or other axes are proposed if they leave less than this share of the error."""
+"""Another unit or other axes are proposed if they reduce the error to less than this share."""
 LEAST_ERROR = 0.3
 """m/s^2; axes with a smaller error are not questioned."""
 
@@ -48,8 +48,8 @@ class ImuProbe:
 
 
 def measured(gyro: F64, accel: F64) -> Mask:
-    """(k,) which samples (k, 3), as recorded, an IMU can have measured. Without acceleration, if some have one, are
-    those of a driver that has lost its device."""
+    """(k,) which samples (k, 3), as recorded, an IMU can have measured. If only some have no acceleration, these come
+    from a driver that has lost its device."""
     usual = (np.abs(accel) < ABSURD).all(axis=1) & (np.abs(gyro) < ABSURD).all(axis=1)
     felt = usual & accel.any(axis=1)
     return np.asarray(felt if felt.any() else usual)
@@ -70,7 +70,7 @@ AS_IS = ALL_AXES[0]
 
 @dataclass(frozen=True, slots=True)
 class ImuUnits:
-    """Makes rad/s and m/s^2 in the IMU frame of what is recorded."""
+    """Converts recorded values to rad/s and m/s^2 in the IMU frame."""
 
     gyro: Axes
     accel: Axes
@@ -88,7 +88,7 @@ AS_RECORDED = ImuUnits(AS_IS, AS_IS)
 
 
 def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[ImuUnits, list[Finding]]:
-    """Units and axes as chosen, or where that is `auto` by the first samples; and findings.
+    """Units and axes as chosen or, where the choice is `auto`, by the first samples; and findings.
 
     Raises:
         HemislamError: the accelerometer reads nothing at all.
@@ -154,7 +154,7 @@ def _acceleration_unit(norm: float, chosen: str) -> tuple[float, list[Finding]]:
 
 
 def _gyroscope_unit(gyro: F64, sway: "Sway | None", chosen: str) -> tuple[float, list[Finding]]:
-    """The factor to rad/s, by how gravity turns, or by what a hand can do."""
+    """The factor to rad/s, by how gravity turns, or by how fast a hand can turn."""
     if chosen != "auto":
         return GYROSCOPE_UNITS[chosen], []
     turning = turning_rate(gyro)
@@ -168,12 +168,12 @@ def _gyroscope_unit(gyro: F64, sway: "Sway | None", chosen: str) -> tuple[float,
 
 
 def turning_rate(gyro: F64) -> float:
-    """What a tenth of the samples (k, 3) exceed, in their unit."""
+    """The rate that a tenth of the samples (k, 3) exceed, in their unit."""
     return float(np.percentile(np.linalg.norm(gyro, axis=1), 90))
 
 
 def too_fast(rate: float, when: str = "") -> Finding:
-    """A gyroscope taken as in rad/s reads more than `TOO_FAST`."""
+    """The finding that a gyroscope, read as rad/s, exceeds `TOO_FAST`."""
     text = f"the gyroscope reads {rate:.0f}{when}, too fast for a hand in rad/s: it may be in deg/s"
     return Finding("IMU units", "needs you", text, f"{_GYROSCOPE_OPTION}deg/s")
 
@@ -184,8 +184,8 @@ def _axes_finding(sway: "Sway", gyro_unit: float, chosen: RecordingParams) -> li
     best = min(errors, key=lambda axes: errors[axes])
     if errors[best] > CLEARLY * errors[AS_IS] or errors[AS_IS] < LEAST_ERROR:
         return []
-    # Turning all axes of one sensor or back those of the other is the same, and so is gravity upside down. A mirrored
-    # gyroscope is different: no change of the accelerometer's axes corrects it.
+    # Turning the axes of one sensor, or those of the other the opposite way, is equivalent; so is gravity upside down.
+    # A mirrored gyroscope is different: no change of the accelerometer's axes corrects it.
     name, given, change = "gyroscope", chosen.gyroscope_axes, _matrix(best)
     if np.linalg.det(change) > 0:
         back = change.T
@@ -198,7 +198,7 @@ def _axes_finding(sway: "Sway", gyro_unit: float, chosen: RecordingParams) -> li
 
 
 def _stuck(probe: ImuProbe) -> list[Finding]:
-    """An axis that reads the same number in every sample measures nothing."""
+    """Axes that read the same number in every sample: they measure nothing."""
     if len(probe.gyro) < 100:
         return []
     names = [
@@ -215,8 +215,8 @@ def _stuck(probe: ImuProbe) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True)
 class Sway:
-    """Where the device swayed: mean accelerations (n, 3) m/s^2 at the begin and end of spans, and each span's
-    rotation vectors (n, m, 3), rad in the gyroscope's recorded unit, of its m samples in turn."""
+    """Spans in which the device swayed: mean accelerations (n, 3) m/s^2 at the start and end of each, and the rotation
+    vectors (n, m, 3) of its m samples in turn, rad in the gyroscope's recorded unit."""
 
     begin: F64
     end: F64
@@ -224,7 +224,7 @@ class Sway:
 
     @classmethod
     def of(cls, stamps_ns: I64, gyro: F64, accel: F64) -> "Sway | None":
-        """In the longest part without a gap, since a wrong stamp can be years off. None if the samples are too few."""
+        """From the longest part without a gap, since a wrong stamp can be years off. None without enough samples."""
         edges = np.r_[0, np.flatnonzero(np.abs(np.diff(stamps_ns)) > GAP_NS) + 1, len(stamps_ns)]
         longest = int(np.argmax(np.diff(edges)))
         part = slice(edges[longest], edges[longest + 1])
@@ -243,7 +243,7 @@ class Sway:
         return cls(begin, end, rates * step)
 
     def error(self, gyro_unit: float, axes: Axes = AS_IS) -> float:
-        """m/s^2, RMS: how far gravity at the end of a span is from where the gyroscope turns it."""
+        """m/s^2, RMS: how far gravity at the end of a span is from its direction according to the gyroscope."""
         unit = _matrix(axes) * gyro_unit
         n, m, _ = self.steps.shape
         turns = Rotation.from_rotvec((self.steps @ unit.T).reshape(-1, 3)).as_matrix().reshape(n, m, 3, 3)
@@ -267,10 +267,10 @@ def _window_means(times: F64, values: F64, starts: F64) -> F64:
 
 
 def gravity_findings(probe: ImuProbe, units: ImuUnits, params: Params, preset: str = "") -> list[Finding]:
-    """The direction of down in the LiDAR frame, by the IMU's first samples, and whether the mount was given.
+    """The direction of down in the LiDAR frame, by the IMU's first samples, and whether the mounting was given.
 
     Args:
-        preset: of the sensor that the clouds look like, "" if they look like none.
+        preset: of the sensor that the clouds look like; "" if unknown.
     """
     first = probe.stamps_ns - probe.stamps_ns[0] <= params.imu.start_duration * 1e9
     accel, gyro = _reordered(probe.accel[first], units.accel), _reordered(probe.gyro[first], units.gyro)

@@ -22,14 +22,14 @@ from app.slam.sections import RecordingParams
 from app.slam.types import F32, U16
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # odd numbers are left out, or a finding
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # invalid numbers are left out, or give a finding
 def settle_cloud(
     probes: list[Probe], chosen: RecordingParams, where: str, kind: CloudType = POINT_CLOUD_2
 ) -> tuple[CloudLayout, list[Finding]]:
     """Decide the layout of topic `where` from its first clouds, each with at least one valid point.
 
     Raises:
-        HemislamError: the clouds have no x, y, z, or not the time field that was asked for.
+        HemislamError: the clouds lack x, y, z, or the chosen time field.
     """
     (usual, _), *_ = Counter(tuple(probe.cloud.fields) for probe in probes).most_common()
     probes = [probe for probe in probes if tuple(probe.cloud.fields) == usual]  # others are left out later
@@ -56,7 +56,7 @@ def settle_cloud(
             if share < 1.0:
                 rate = share * 1e9 / scan_period_ns(probes, 0.0)[0]
                 time_findings[0] = _of_parts(time_findings[0], share, rate, chosen.rotation_rate)
-        if spin.start is None:  # then only the cloud's own first or last point can be at the header stamp
+        if spin.start is None:  # then the header stamp can only be the time of the cloud's own first or last point
             timing = replace(timing, anchor="last" if timing.shift_ns else "first", shift_ns=0)
     else:
         if rings.of_lines:
@@ -79,7 +79,7 @@ def settle_cloud(
 
 
 def _of_parts(found: Finding, share: float, rate: float, chosen_rate: float) -> Finding:
-    """The finding on times from the azimuth, where each message holds this share of a turn."""
+    """The finding on times from the azimuth if each message holds only this share of a turn."""
     text = f"the sensor turns {rate:.3g} times a second, and {_held(share)}; times are {found.text}"
     if abs(chosen_rate - rate) < 0.1 * rate:
         return replace(found, verdict="corrected", text=text)

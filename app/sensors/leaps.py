@@ -1,8 +1,9 @@
 """Leaps of a clock in the middle of a recording, and how they are bridged.
 
 A scanner counts from power-on until it has found its time server, and the clock of a small computer is set once there
-is a network. LiDAR, IMU and recorder may each have a clock of their own. What a clock shows after its last leap is
-taken as right, and earlier times are moved so that they go on into it; unless LiDAR and IMU agreed before only.
+is a network. LiDAR, IMU and recorder may each have a clock of their own. The time after a clock's last leap is taken as
+right, and earlier times are shifted so that time is continuous. If LiDAR and IMU agreed only before the leaps, the
+time before is taken as right instead.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -16,13 +17,13 @@ from app.slam.types import F64, I64, Scan
 LEAST_NS = 500_000_000
 """Smaller changes are delays of logging, or drift."""
 JITTER_NS = 50_000_000
-"""Steps that differ by less are the same."""
+"""Steps that differ by less count as the same."""
 ALIKE = 1.5, 2.0
-"""An IMU or a view goes on if it changes by less than this many times what it changes by within 2 s."""
+"""An IMU or a view continues across a silence if it changes by less than this many times its change within 2 s."""
 STRIDE_NS = 5_000_000_000
 """Silence is looked for at intervals of this."""
 AROUND_NS = 2_000_000_000
-"""On either side of a leap, this much is looked at."""
+"""Time on either side of a leap that is examined."""
 END_NS = 2**62
 
 Times = Callable[[int, int], Iterable[tuple[int, int]]]
@@ -33,7 +34,7 @@ Times = Callable[[int, int], Iterable[tuple[int, int]]]
 class Leap:
     """A clock that was set. at_ns: log time of the first message after it. by_ns: how far it leapt.
 
-    One at `END_NS` moves all times back to the clock before the others.
+    A leap at `END_NS` moves all times back to the clock before the other leaps.
     """
 
     at_ns: int
@@ -42,14 +43,14 @@ class Leap:
 
 @dataclass(frozen=True, slots=True)
 class Leaps:
-    """Those of the LiDAR's stamps, of the IMU's and of the recorder's own clock, each in order of time."""
+    """The leaps of the LiDAR's stamps, of the IMU's stamps and of the recorder's clock, each in order of time."""
 
     lidar: tuple[Leap, ...] = ()
     imu: tuple[Leap, ...] = ()
     log: tuple[Leap, ...] = ()
 
     def recorded_ns(self, log_ns: int) -> int:
-        """The log time in the file that is this one after bridging."""
+        """The log time in the file that becomes this one by bridging."""
         for leap in reversed(self.log):
             if log_ns < leap.at_ns:
                 log_ns = min(log_ns - leap.by_ns, leap.at_ns)
@@ -57,23 +58,23 @@ class Leaps:
 
 
 def added_ns(leaps: tuple[Leap, ...], log_ns: int) -> int:
-    """What bridges the leaps, to add to the time of a message that was logged at `log_ns`."""
+    """ns to add to the time of a message that was logged at `log_ns`, to bridge the leaps."""
     return sum(leap.by_ns for leap in leaps if log_ns < leap.at_ns)
 
 
 def all_added_ns(leaps: tuple[Leap, ...], log_ns: I64) -> I64:
-    """The same of each of (n,) messages."""
+    """The same for each of (n,) messages."""
     return np.array([added_ns(leaps, one) for one in log_ns.tolist()], np.int64)
 
 
 def find_leaps(
     lidar: Times, imu: Times | None, start_ns: int, end_ns: int, scans_ns: int, continues: Callable[[int, int], bool]
 ) -> Leaps:
-    """Find them by bisection, where stamps and log times no longer go together, and where all clocks leap ahead.
+    """Find the leaps by bisection: where stamps and log times part, and where all clocks leap ahead.
 
     Args:
-        start_ns, end_ns: log times of the first and last message. scans_ns: how long the scans last, all together.
-        continues: whether the scan logged at the second time goes on from the one logged at the first.
+        start_ns, end_ns: log times of the first and last message. scans_ns: total duration of the scans.
+        continues: whether the scan logged at the second time continues the one logged at the first.
     """
     topics = [lidar] if imu is None else [lidar, imu]
     moments = sorted(moment for times in topics for moment in _moments(times, start_ns, end_ns))
@@ -110,13 +111,13 @@ def find_leaps(
 
 
 def _apart(topics: list[Times], first_ns: int, end_ns: int) -> int:
-    """ns by which the LiDAR's stamps are ahead of the IMU's at a part's start; 0 if it holds not both."""
+    """ns by which the LiDAR's stamps are ahead of the IMU's at a part's start; 0 if it lacks one of the two."""
     looks = [_look(times, first_ns, end_ns) for times in topics]
     return looks[0][1] - looks[1][1] if looks[0] and looks[1] else 0
 
 
 def leap_sentences(leaps: Leaps, start_ns: int) -> dict[int, str]:
-    """What to tell of each, by its log time in the file; `start_ns` is the first log time after bridging."""
+    """A sentence for each leap, by its log time in the file; `start_ns` is the first log time after bridging."""
     moments: dict[int, dict[str, list[str]]] = {}
     for name, own in (("LiDAR", leaps.lidar), ("IMU", leaps.imu), ("recorder", leaps.log)):
         for leap in own:
@@ -132,7 +133,7 @@ def leap_sentences(leaps: Leaps, start_ns: int) -> dict[int, str]:
 
 
 def _moments(times: Times, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-    """Log times of two successive messages of a topic, for each two between which stamps and log times part."""
+    """Log times of each pair of successive messages of a topic between which stamps and log times part."""
     first, last = _look(times, start_ns, end_ns), None
     at_ns, back_ns = end_ns, LEAST_NS
     while first and not last and at_ns > start_ns:  # from the topic's end, which may be earlier
@@ -160,7 +161,7 @@ def _between(times: Times, first: tuple[int, int], last: tuple[int, int]) -> lis
 
 
 def _silences(times: Times, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-    """Log times of two successive messages, for each two far apart; less than 7 s may be missed."""
+    """Log times of each pair of successive messages that are far apart; pairs less than 7 s apart may be missed."""
     found, at_ns = [], start_ns
     while (look := _look(times, at_ns, end_ns)) is not None:
         if look[0] - at_ns > AROUND_NS and len(before := _listed(times, at_ns - STRIDE_NS, at_ns)):
@@ -178,7 +179,7 @@ def same_motion(before: F64, after: F64) -> bool:
 
 
 def same_view(before: Sequence[Scan], after: Sequence[Scan]) -> bool:
-    """Whether the scans on either side of a silence show the same: the last before it and the first after it."""
+    """Whether the last scans before a silence and the first after it show the same surroundings."""
     if min(len(before), len(after)) < 2:
         return False
     views = [_view(scan) for scan in (*before[-3:], *after[:3])]
@@ -207,14 +208,14 @@ def _change(before: F64, after: F64) -> float:
 
 
 def _look(times: Times, first_ns: int, end_ns: int) -> tuple[int, int] | None:
-    """Log time of the first message from then on, and by how much stamps are ahead of log times; None without any."""
+    """Log time of the first message from `first_ns` on, and the lead of its stamp over it; None without a message."""
     messages = np.array(list(islice(times(first_ns, end_ns + 1), 3)), np.int64).reshape(-1, 2)
     return (int(messages[0, 0]), int(np.median(messages[:, 1] - messages[:, 0]))) if len(messages) else None
 
 
 def _greatest_steps(times: Times, before_ns: int, after_ns: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The greatest step of a topic's stamps around this moment, and of its log times: the log time after it, and by how
-    much it exceeds the usual interval."""
+    """The greatest step of a topic's stamps around this moment, and that of its log times. Each is given by the log
+    time after it and its excess over the usual interval."""
     messages = _listed(times, before_ns - AROUND_NS, after_ns + AROUND_NS)
     if len(messages) < 3:
         return (after_ns, 0), (after_ns, 0)

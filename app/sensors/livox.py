@@ -43,7 +43,7 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-"""Of livox_ros_driver2's message in ROS 2."""
+"""The definition of livox_ros_driver2's message in ROS 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class CustomMsg:
 
     @classmethod
     def of(cls, data: bytes, encoding: str) -> "CustomMsg":
-        """Of a message in CDR or in ROS 1's encoding. Raises struct.error if it ends before its points."""
+        """From a message in CDR or in ROS 1's encoding. Raises struct.error if it ends before its points."""
         order, at, step = "<", 4, 19  # after the sequence number
         if encoding == "cdr":
             order, at, step = "<" if data[1] & 1 else ">", 4, 20  # after the encapsulation header
@@ -76,7 +76,7 @@ class CustomMsg:
 
     @classmethod
     def made(cls, times_ns: I64, points: F32, reflectivity: U8, tag: U8) -> "CustomMsg":
-        """Of points (n, 3) m at times (n,), stamped at the earliest."""
+        """From points (n, 3) m at times (n,), stamped at the earliest."""
         begin_ns = int(times_ns.min())
         rows = np.zeros(len(points), _dtype("<", 20))
         rows["x"], rows["y"], rows["z"] = points.T
@@ -90,7 +90,7 @@ class CustomMsg:
 
     @property
     def fields(self) -> dict[str, tuple[int, np.dtype[Any]]]:
-        """Name -> (offset in bytes, type), of a point."""
+        """Fields of a point: name -> (offset in bytes, type)."""
         return {name: (at, kind) for name, (kind, at, *_) in (self.points.dtype.fields or {}).items()}
 
     @property

@@ -1,26 +1,26 @@
-"""Log times of a file that step back, or are far from those around them, as a bit that was turned makes them."""
+"""Log times of a file that step back, or are far from those around them, as after a flipped bit."""
 
 import numpy as np
 
 from app.slam.types import I64
 
 FAR_NS = 10_000_000_000
-"""Few messages that were logged this long before or after all others have wrong log times."""
+"""If a few messages were logged this long before or after all others, their log times are wrong."""
 WILD_NS = 2_000_000_000
-"""So has a message that was logged this long before or after its neighbours in the file."""
+"""If a message was logged this long before or after its neighbours in the file, its log time is wrong."""
 FEW = 20
-"""So many messages, a tenth of a second of a walk, are no part of a recording of their own."""
+"""This many messages, a tenth of a second of a walk, are too few to be a separate part of a recording."""
 SET_BACK_NS = 500_000_000
-"""Log times on one topic that step back by more do so because the recorder's clock was set."""
+"""If log times on one topic step back by more, the recorder's clock was set."""
 LATEST_NS = 2**62
 """The year 2116; later log times are cut to it, so that integers hold their differences."""
 _REACH = 10
-"""A log time is compared with this many before it and after it."""
+"""A log time is compared with this many before it and as many after it."""
 
 
 def sound_span(times: I64) -> tuple[int, int, int]:
-    """Of (n,) log times in any order, without a few at the ends that are far from all others: the first, the end after
-    the last, and how many these few are."""
+    """The span of (n,) log times in any order, without a few at either end that are far from all others: the first, the
+    end after the last, and the number left out."""
     times = np.sort(np.clip(times, 0, LATEST_NS))
     begins = np.array([0, *np.flatnonzero(np.diff(times) > FAR_NS) + 1, len(times)])
     parts = np.flatnonzero(np.diff(begins) > FEW)
@@ -29,7 +29,7 @@ def sound_span(times: I64) -> tuple[int, int, int]:
 
 
 def mended(times: I64) -> dict[int, int]:
-    """Better ones for those of (n,) log times in the order of a file that are far from their neighbours; by number."""
+    """Better values, by index, for those of (n,) log times in file order that are far from their neighbours."""
     if len(times) <= 2 * _REACH:
         return {}
     padded = np.pad(times, _REACH, mode="reflect")

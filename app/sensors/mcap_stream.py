@@ -1,5 +1,5 @@
-"""Reads MCAP files from front to back: those that rosbags refuses, cut off or without a ROS 2 profile, and those that
-it would mix up, since it sorts by log time and the recorder's clock was set back.
+"""Reads MCAP files from front to back: files that rosbags refuses (cut off, or without a ROS 2 profile), and files that
+it would put in a wrong order, since it sorts by log time and the recorder's clock was set back.
 """
 
 import struct
@@ -22,13 +22,13 @@ from app.slam.errors import printable
 
 
 class McapStream:
-    """Topics and messages of the pieces of a recording, as far as each reaches. Needs no index, no summary and no end.
+    """Topics and messages of the pieces of a recording, as far as each reaches. Needs no index, summary or footer.
 
     Attributes:
         counts: topic -> (type as in ROS 2, number of messages). start_ns, end_ns: log times.
         cut: the pieces without an end, in order of time.
-        set_back: (number of a message, ns): where the recorder's clock was set back, and by how much. From there on
-            this is added to log times, so that they go on.
+        set_back: (number of a message, ns): where the recorder's clock was set back, and by how much. From there on,
+            this is added to log times, so that they are continuous.
         sorted: whether log times never step back, not even by a little.
         wild: how many messages have log times far from those around them; better ones are given for these.
     """

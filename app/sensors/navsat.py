@@ -13,7 +13,7 @@ from app.slam.errors import HemislamError
 NAVSAT = "sensor_msgs/msg/NavSatFix"
 TOPIC = "/fix"
 _UNKNOWN, _DIAGONAL = 0, 2
-"""Types of a covariance."""
+"""NavSatFix's types of covariance."""
 
 
 def navsat_topic(source: Source) -> str:

@@ -35,14 +35,14 @@ _POINT = np.dtype(
     }
 )
 MOST_COLUMNS = 4096
-"""Of a turn, in the finest mode of any Ouster."""
+"""Most columns of a turn, in the finest mode of any Ouster."""
 LATE = 4
-"""After this many packets of the next turn, packets of this one are no longer waited for."""
+"""After this many packets of the next turn, the present turn is given out even if packets are missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Return:
-    """Where a pixel holds a return: layout, bits and unit (mm) of its range; place of its reflectivity."""
+    """Layout of a return in a pixel: place, bits and unit (mm) of its range; place of its reflectivity."""
 
     at: int
     layout: str
@@ -53,7 +53,7 @@ class _Return:
 
 @dataclass(frozen=True, slots=True)
 class _Profile:
-    """A format of packets: bytes around its columns, of a column's header and end, and of a pixel; its returns."""
+    """A packet format: bytes before and after the columns, of a column's header and end, of a pixel; its returns."""
 
     header: int
     column_header: int
@@ -71,7 +71,7 @@ _PROFILES = {
     ),
     "RNG15_RFL8_NIR8": _Profile(32, 12, 0, 32, 4, (_Return(0, "<u2", 0x7FFF, 8, 2),)),
 }
-"""By the name in the metadata."""
+"""Packet formats by their names in the metadata."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Metadata:
     """What an Ouster states about itself.
 
     Attributes:
-        name: of the product. profile: of its packets. columns: of a packet. width: columns of a turn.
+        name: of the product. profile: of its packets. columns: number in a packet. width: columns of a turn.
         elevations, azimuths: (rows,) rad of each beam. origin_mm: of the beams, from the axis.
         T_imu_lidar: (4, 4), m.
     """
@@ -149,7 +149,7 @@ class Metadata:
 
 
 def metadata_beside(capture: Path) -> Metadata | None:
-    """That of the .json with the capture's name, or NAME_0; else of the longest name that the capture's begins with."""
+    """The metadata in the .json with the capture's name, or NAME_0; else in that whose name is its longest prefix."""
     named = (capture.stem, f"{capture.stem}_0")
     beside = [
         path for path in capture.parent.glob("*.json") if path.stem in named or capture.stem.startswith(path.stem)
@@ -174,13 +174,13 @@ class Turns:
         """The turns that this packet shows to be over, each in order of its columns."""
         if turn not in self._open:
             if self._ended is not None and _ahead(turn, self._ended) in (-1, 0):
-                return  # too late
+                return  # it comes too late
             if any(abs(_ahead(turn, other)) > 1 for other in self._open):  # turns were lost, or the sensor restarted
                 yield from self.rest()
         there = self._open.get(turn, {}).get(column)
         if there == packet:
             return  # it came twice
-        if there is not None:  # the number stands still
+        if there is not None:  # the turn's number does not advance
             yield self._end(turn)
         self._open.setdefault(turn, {})[column] = packet
         first = min(self._open, key=lambda other: _ahead(other, turn))
@@ -200,7 +200,7 @@ class Turns:
 
 
 class OusterStream(PacketStream):
-    """A capture of an Ouster; its contents are an IMU packet (bytes), or all packets of a scan (a list)."""
+    """A capture of an Ouster. An entry is an IMU packet (bytes), or all packets of a scan (a list)."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         """Raises CaptureError: the file is no capture."""
@@ -302,5 +302,5 @@ def _imu_message(packet: bytes) -> Any:
 
 
 def _ahead(turn: int, of: int) -> int:
-    """By how many turns, around the counter's end."""
+    """By how many turns one number is ahead of the other, allowing for the counter's overflow."""
     return (turn - of + 0x8000) % 0x10000 - 0x8000

@@ -1,6 +1,6 @@
 """From a point-cloud message to a `Scan`, without a loop over points.
 
-`CloudLayout` holds all that was settled once for a topic (`layout.py`); `read_scan` applies it to one message.
+`CloudLayout` holds everything that was settled for a topic (`layout.py`); `read_scan` applies it to one message.
 """
 
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ class CloudLayout:
     stamped: bool = True
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what comes of odd numbers is left out
+@np.errstate(over="ignore", invalid="ignore")  # results of invalid numbers are left out
 def read_scan(message: Any, log_ns: int, layout: CloudLayout) -> tuple[CloudMessage | None, Scan | DroppedScan]:
     """A deserialised message: its content (None if malformed), and the scan, or why there is none."""
     cloud = None

@@ -49,11 +49,12 @@ a shaft)."""
 
 
 class _Appearance(NamedTuple):
-    """What the clouds of a scanner with an IMU of its own look like; all go all around.
+    """What the clouds of a scanner with a built-in IMU look like; all of these scanners see all around.
 
     Attributes:
-        preset: of the scanner. kinds: types of message. fields: that they have among others.
-        lines: numbers of scan lines; (): any. lowest, highest: deg, bounds of the lowest and of the highest elevation.
+        preset: of the scanner. kinds: message types. fields: that the clouds must have, among others.
+        lines: possible numbers of scan lines; (): any. lowest, highest: deg, bounds of the lowest and of the highest
+            elevation.
     """
 
     preset: str
@@ -101,11 +102,11 @@ def built_in_mounting(preset: str, imu_topic: str) -> dict[str, Any]:
 CALIBRATED = "# Written by `hemislam calibrate`"
 """First line of a parameter file that hemislam wrote."""
 MERGED = f"{CALIBRATED} into the one kept as .old."
-"""The same of a file that a user wrote and hemislam changed."""
+"""First line of a parameter file that a user wrote and hemislam changed."""
 
 
 def sidecar(recording: Path) -> Path:
-    """Where a recording's own parameters would be: `<stem>.params.yaml` beside it."""
+    """The path of a recording's own parameters: `<stem>.params.yaml` beside it."""
     return recording.parent / f"{recording.name if recording.is_dir() else recording.stem}.params.yaml"
 
 
@@ -119,7 +120,7 @@ def uncalibrated(recording: Path) -> Path | None:
 
 
 def calibrated_beside(recording: Path) -> str:
-    """A sentence that names the calibration beside a recording that is in use; "" if there is none."""
+    """A sentence that names the calibration in use beside a recording; "" if there is none."""
     path = sidecar(recording)
     ours = _first_line(path).startswith(CALIBRATED)
     return f"Using the calibration beside the recording: {path}; delete it to undo this." if ours else ""

@@ -22,7 +22,7 @@ PROBED_IMU_NS = 20_000_000_000
 PACKETS = {
     "VelodyneScan", "PacketMsg", "RslidarPacket", "rslidarScan", "PandarScan", "UdpFrame", "UdpPacket", "NebulaPackets"
 }  # fmt: skip
-"""Names of message types that hold packets: of the Velodyne, Ouster, RoboSense and Hesai drivers, and of Nebula."""
+"""Names of message types that hold raw packets: of the Velodyne, Ouster, RoboSense and Hesai drivers, and of Nebula."""
 
 
 def usable_types(sensor: Literal["lidar", "imu"]) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ def choose_topic(source: Source, sensor: Literal["lidar", "imu"], wanted: str) -
         return candidates[0], Finding(subject, "fine", f"{candidates[0].name}, {candidates[0].messages} messages")
     content_of = {topic.name: _content(source, topic) for topic in candidates}
     fullest = max(content_of.values())
-    chosen = max(candidates, key=lambda topic: (content_of[topic.name], topic.messages))  # the first of equals
+    chosen = max(candidates, key=lambda topic: (content_of[topic.name], topic.messages))  # in a tie, the first
     rest = ", ".join(topic.name for topic in candidates if topic is not chosen)
     if sum(content == fullest for content in content_of.values()) == 1:
         what = "times or rings" if sensor == "lidar" else "both accelerations and rates"
@@ -74,8 +74,8 @@ def choose_topic(source: Source, sensor: Literal["lidar", "imu"], wanted: str) -
 
 
 def _content(source: Source, topic: Topic) -> int:
-    """How much of what is needed a topic's first messages hold: a depth camera's clouds, or those that a program has
-    registered, have neither times nor rings, and some IMUs send accelerations and rates on two topics."""
+    """How much of the needed content a topic's first messages hold. Clouds of a depth camera, or clouds that a program
+    has registered, have neither times nor rings, and some IMUs send accelerations and rates on two topics."""
     first = [message for _, _, message in islice(_readable(source.messages((topic.name,))), 5)]
     if topic.type == IMU:
         accel, gyro = (np.array([imu_values(message)[part] for message in first]) for part in (1, 0))
@@ -93,7 +93,7 @@ def probe_clouds(source: Source, topic: Topic) -> tuple[list[Probe], list[Findin
     """The first clouds that have points, and findings.
 
     Raises:
-        HemislamError: there are not two of them.
+        HemislamError: there are fewer than two.
     """
     probes: list[Probe] = []
     unusable, reason = 0, ""
@@ -163,7 +163,7 @@ def _stamp_findings(stamps: list[int], topic: str) -> list[Finding]:
 
 
 def _readable(entries: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
-    """Everything before a damaged place; reading the recording reports the damage later."""
+    """The entries before any damage; reading the recording reports the damage later."""
     some = False
     try:
         for entry in entries:

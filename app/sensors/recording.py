@@ -38,7 +38,7 @@ from app.slam.params import Params
 from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan, Vector
 
 SILENCE_S = 0.5
-"""A gap without scans at the end, while the IMU goes on, is reported if it is longer than this."""
+"""A gap without scans at the end, while the IMU continues, is reported if it is longer than this."""
 LACKS = "the file is damaged: its index tells of more messages than there are"
 NO_IMU = Finding(
     "IMU topic",
@@ -51,7 +51,7 @@ IMU_BEFORE_NS = 200_000_000
 
 @dataclass(frozen=True, slots=True)
 class ScanEntry:
-    """A point cloud message: when it was logged, its content (None if malformed), and what it decodes to."""
+    """A point cloud message: its log time, its content (None if malformed), and the scan decoded from it."""
 
     log_ns: int
     cloud: CloudMessage | None
@@ -60,7 +60,7 @@ class ScanEntry:
 
 @dataclass(frozen=True, slots=True)
 class ImuEntry:
-    """An IMU message: when it was logged, its stamp with all corrections, rad/s and m/s^2 in the IMU frame."""
+    """An IMU message: its log time, its stamp with all corrections, rad/s and m/s^2 in the IMU frame."""
 
     log_ns: int
     stamp_ns: int
@@ -70,7 +70,7 @@ class ImuEntry:
 
 @dataclass(frozen=True, slots=True)
 class OtherEntry:
-    """A message of a sensor beside LiDAR and IMU."""
+    """A message of a sensor other than LiDAR and IMU."""
 
     log_ns: int
     samples: Samples
@@ -80,10 +80,10 @@ class Recording(AbstractContextManager["Recording"]):
     """An open recording, made by `open_recording`. A context manager.
 
     Attributes:
-        path, params: as given. topics: all there are. lidar_topic, imu_topic, gnss_topic: the ones used; ""
-            where there is none.
-        scan_count: messages on the LiDAR topic. findings: of the first messages.
-        preset: of the scanner that the clouds look like; "" if they look like none that is known.
+        path, params: as given. topics: of the file. lidar_topic, imu_topic, gnss_topic: the ones used; ""
+            if there is none.
+        scan_count: messages on the LiDAR topic. findings: from the first messages.
+        preset: of the scanner that the clouds look like; "" if unknown.
         start_ns: first point of the first usable scan. duration_s: from there to the last message.
     """
 
@@ -135,7 +135,7 @@ class Recording(AbstractContextManager["Recording"]):
         )
 
     def _look_at_clocks(self) -> None:
-        """Whether the IMU's headers carry times, and where clocks leap."""
+        """Find out whether the IMU's headers carry times, and where clocks leap."""
         self._imu_stamped, self._imu_units, self._leaps = True, AS_RECORDED, Leaps()
         self._imu_probe: tuple[ImuProbe, list[Finding]] | None = None
         if self.imu_topic:
@@ -165,7 +165,7 @@ class Recording(AbstractContextManager["Recording"]):
         self._leaps = find_leaps(times(self.lidar_topic), of_imu, source.start_ns, source.end_ns, scans_ns, continues)
 
     def _look_at_imu(self, scan_times: I64) -> list[Finding]:
-        """Settle how its samples are read, by the first ones; `scan_times` as for `clock_finding`."""
+        """Settle how IMU samples are read, from the first ones; `scan_times` as for `clock_finding`."""
         if self._imu_probe is None:
             return []
         chosen = self.params.recording
@@ -183,7 +183,7 @@ class Recording(AbstractContextManager["Recording"]):
         return self._layout.rings.of_lines
 
     def sequencer(self) -> Sequencer:
-        """A new one that pairs scans with what this recording has."""
+        """A new sequencer, set up for the sensors of this recording."""
         return Sequencer(self.params.imu, without_imu=not self.imu_topic)
 
     def measurements(
@@ -192,17 +192,17 @@ class Recording(AbstractContextManager["Recording"]):
         """Scans that begin within [start_s, start_s + duration_s) after `start_ns`, with their IMU samples.
 
         Args:
-            after: where an earlier reading of the same part was; this one goes on exactly as that one did.
+            after: the place of an earlier reading of the same part; this reading continues exactly from there.
         """
         return Measurements(self, start_s, duration_s, after)
 
     def entries(
         self, first_ns: int | None = None, stop_ns: int | None = None, after: Mark | None = None
     ) -> Iterator[ScanEntry | ImuEntry | OtherEntry]:
-        """Decoded scans and samples in the order of the file; generously more than [first, stop).
+        """Decoded scans and samples in the order of the file, from some time before `first` to some time after `stop`.
 
         Args:
-            after: only what comes after this message.
+            after: only entries after this message.
 
         Raises:
             HemislamError: where the file is damaged.
@@ -235,7 +235,7 @@ class Recording(AbstractContextManager["Recording"]):
         return recorded_ns + all_added_ns(self._leaps.log, recorded_ns)
 
     def lacks_messages(self, read: int) -> bool:
-        """Whether so many messages, read from begin to end, are fewer than the file's index tells."""
+        """Whether `read` messages, from a complete reading, are fewer than the file's index states."""
         return self._source.lacks(self._topics, read)
 
     def leaps_told(self, after_ns: int, until_ns: int) -> list[str]:
@@ -243,7 +243,7 @@ class Recording(AbstractContextManager["Recording"]):
         return [text for at_ns, text in self._leaps_told.items() if after_ns < at_ns <= until_ns]
 
     def fraction_at(self, log_ns: int) -> float:
-        """Share of the recording, 0-1, that was logged before."""
+        """Share of the recording, 0-1, that was logged before this time."""
         length = self._source.end_ns - self._source.start_ns
         return min(max((log_ns - self._source.start_ns) / length, 0.0), 1.0) if length > 0 else 1.0
 
@@ -264,7 +264,7 @@ class Recording(AbstractContextManager["Recording"]):
         return [probe for probe, _ in decoded], [scan for _, scan in decoded]
 
     def nothing_usable(self, reasons: Counter[str], start_s: float, duration_s: float | None) -> str:
-        """Why no measurement could be read, in a sentence; `reasons` of the scans that were left out."""
+        """Why no measurement could be read, in a sentence. reasons: of the scans that were left out."""
         if not reasons:
             until = "" if duration_s is None else f" and before {start_s + duration_s:g} s"
             return f"{self.path} has no scan after {start_s:g} s{until}; it lasts {self.duration_s:.1f} s."
@@ -281,7 +281,7 @@ class Recording(AbstractContextManager["Recording"]):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a reading is, between two measurements: the last message read, and the state of pairing."""
+    """The place of a reading between two measurements: the last message read, and the state of pairing."""
 
     message: Mark | None
     sequencer: Sequencer
@@ -292,8 +292,8 @@ class Place:
 class Measurements(Iterator[Measurement | DroppedScan]):
     """A reading of a recording, made by `Recording.measurements`.
 
-    Iterating raises HemislamError at the end, if no scan could be used; or where the file is
-    damaged, after all that comes before the damage.
+    Iterating raises HemislamError at the end if no scan could be used, or, after all that comes
+    before it, at a damaged place in the file.
     """
 
     def __init__(self, recording: Recording, start_s: float, duration_s: float | None, after: Place | None) -> None:
@@ -312,7 +312,7 @@ class Measurements(Iterator[Measurement | DroppedScan]):
         return entry
 
     def place(self) -> Place:
-        """Where it is now; cheap."""
+        """The present place; cheap."""
         return Place(self._message, self._sequencer.copy(), self._reasons.copy(), self._ended)
 
     def _read(self) -> Iterator[Measurement | DroppedScan]:
@@ -351,10 +351,10 @@ class Measurements(Iterator[Measurement | DroppedScan]):
 
 
 def open_recording(path: Path, params: Params) -> Recording:
-    """Open and look at the first messages.
+    """Open a recording and examine its first messages.
 
     Raises:
-        HemislamError: the file cannot be read, has no LiDAR, or nothing usable on its topics.
+        HemislamError: the file cannot be read, has no LiDAR topic, or has nothing usable on its topics.
     """
     source = Source(path)
     try:

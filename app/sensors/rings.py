@@ -1,7 +1,7 @@
 """Which scan line a point belongs to: the rank of the line's elevation, 0 = lowest = outermost cone.
 
-The ring comes from a field (put in order of elevation where the driver numbers in another order), from a point's
-place in the message, or, if neither helps, from its elevation.
+The ring comes from a field (sorted by elevation if the driver numbers the lines differently), from a point's place in
+the message, or, if neither helps, from its elevation.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from app.slam.types import F32, F64, I64, U16, Scan
 _ENOUGH = 50_000
 """Points that suffice to separate the lines."""
 _LEAST_LINES = 4
-"""Fewer are no scan lines: the pattern does not repeat."""
+"""Fewer lines are not scan lines: the pattern does not repeat."""
 RING_DEG = 2.0
-"""Elevation that counts as a line where there are none."""
+"""Width in elevation of a ring if the sensor has no scan lines."""
 _COMMON_LINES = (16, 32, 40, 64, 80, 128)
 
 
@@ -30,11 +30,11 @@ class Rings:
     Attributes:
         field: name of a field; None: from the point's place or elevation.
         place: (step, lines): point i of the message is on line (i // step) % lines.
-        rank: (lines,) uint16, rank by elevation of each value of the field or place; None: it is
-            the rank already.
+        rank: (lines,) uint16, rank by elevation of each value of the field or place; None: the value
+            already is the rank.
         bounds: (lines - 1,) rad, ascending, the elevations that separate the lines.
-        centre: (radial, height) m, where the beams start from as seen by `bounds`.
-        of_lines: False if the sensor has no scan lines, and rings are equal steps of elevation.
+        centre: (radial, height) m, the origin of the beams to which `bounds` refer.
+        of_lines: False if the sensor has no scan lines and rings are equal steps of elevation.
     """
 
     field: str | None = None
@@ -99,7 +99,7 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
 
 
 def line_findings(scans: list[Scan], has_lines: bool, params: SensorParams) -> list[Finding]:
-    """Corrections of scan lines that are not as many as the lines of a recording's first scans."""
+    """Findings about corrections whose number differs from the number of lines in a recording's first scans."""
     found, lines = [], 1 + max(int(scan.ring.max()) for scan in scans if len(scan)) if has_lines else 0
     for name in ("elevation_corrections", "range_corrections"):
         given = len(getattr(params, name).split())
@@ -111,7 +111,7 @@ def line_findings(scans: list[Scan], has_lines: bool, params: SensorParams) -> l
 
 
 def _all_lines(seen: int) -> int:
-    """How many lines a sensor probably has of which so many were seen: some may see nothing but sky at first."""
+    """The probable number of lines of a sensor, given the number seen: some may see only sky at first."""
     return next((lines for lines in (8, *_COMMON_LINES) if lines >= seen), seen) if seen else 0
 
 
@@ -123,7 +123,7 @@ def _settle_steps(points: F32, why: str) -> tuple[Rings, Finding]:
 
 
 def _far(points: F32) -> npt.NDArray[np.intp]:
-    """Indices of the farther half: there the beams' different origins hardly change the elevation."""
+    """Indices of the farther half, where the different origins of the beams hardly change the elevation."""
     distance = np.linalg.norm(points, axis=1)
     far = np.flatnonzero(distance >= np.median(distance))
     return far[:: max(1, len(far) // _ENOUGH)]
@@ -199,7 +199,7 @@ def _settle_elevation(points: F32) -> tuple[F64, tuple[float, float]]:
 
 
 def _spread(raw: I64, angles: F32) -> float:
-    """How far points lie from the elevation of their line, over the distance between two lines."""
+    """Spread of the points about the elevation of their line, relative to the distance between two lines."""
     present, medians = _line_medians(raw, angles)
     within = np.median(np.abs(angles - medians[np.searchsorted(present, raw).clip(max=len(present) - 1)]))
     between = np.median(np.diff(np.sort(medians))) if len(medians) > 1 else np.inf

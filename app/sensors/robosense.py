@@ -23,18 +23,18 @@ ELEVATIONS_DEG: F64 = np.array(
         30.4375, 24.8125, 19.1875, 13.5625, 7.9375, 2.3125,
     ]
 )  # fmt: skip
-"""(32,) nominal elevation above the base plane by channel; a unit's own are in its DIFOP packet."""
+"""(32,) nominal elevation above the base plane by channel; those of each unit are in its DIFOP packet."""
 
 MIN_RANGE_M, MAX_RANGE_M = 0.1, 100.0
 RATED_RANGE_M, RATED_REFLECTIVITY = 30.0, 0.1
-"""The data sheet: 30 m on a target that reflects 10 %."""
+"""By the data sheet: 30 m on a target that reflects 10 %."""
 
 ROTATION_RATES_HZ = (10, 20)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """What differs between the sensors.
+    """The constants of one model.
 
     Attributes:
         range_step: m per count of a packet's distance. block_ns: duration of a block.
@@ -65,7 +65,7 @@ class Model:
 
     @property
     def parts(self) -> int:
-        """Into which a packet divides a block."""
+        """Number of parts into which a packet divides a block."""
         return self.channels // self.part
 
     @property
@@ -114,7 +114,7 @@ AIRY = Model(
     counted=0x3FFF,
     index_at=12,
 )
-"""Its nominal elevations are evenly spaced; each unit states its own."""
+"""The Airy. Its nominal elevations are evenly spaced; each unit states its own."""
 
 
 def rays(elevation: F64, azimuth: F64) -> F64:
@@ -124,5 +124,5 @@ def rays(elevation: F64, azimuth: F64) -> F64:
 
 
 def levers(azimuth: F64, radial: float, height: float) -> F64:
-    """(n, 3) m, where lasers are at these azimuths (n,) of the head, rad."""
+    """(n, 3) m, positions of the lasers at these azimuths (n,) of the head, rad."""
     return np.column_stack([radial * np.cos(azimuth), -radial * np.sin(azimuth), np.full(len(azimuth), height)])

@@ -1,7 +1,7 @@
-"""ROS messages without ROS: read from bytes, made of scans and IMU samples, written to .mcap files.
+"""ROS messages without ROS: read from bytes, made from scans and IMU samples, written to .mcap files.
 
-Clouds are made in the vendor's layout: x, y, z, intensity (f32), ring (u16), `ground` (u8, only where the truth is
-known) and the absolute time of each point. Their stamp is that of the last point.
+Clouds are written in the vendor's layout: x, y, z, intensity (f32), ring (u16), `ground` (u8, only if the truth is
+known) and the absolute time of each point. Their stamp is the time of the last point.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from app.slam.types import Scan, Vector
 LIDAR_TOPIC, IMU_TOPIC = "/rslidar_points", "/imu/data"
 CLOUD, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 ENCODINGS: Final = {"cdr": "ros2msg", "ros1": "ros1msg"}
-"""Encodings of messages that can be read, and how their definitions are written."""
+"""Message encodings that can be read, with the format of their definitions."""
 _STORES: Final = {"cdr": Stores.ROS2_HUMBLE, "ros1": Stores.ROS1_NOETIC}
 
 _ROS2 = get_typestore(Stores.ROS2_HUMBLE)
@@ -44,7 +44,7 @@ class Deserialiser:
         try:
             found = get_types_from_msg(definition, kind)
             store.register({name: fields for name, fields in found.items() if name not in store.types})
-        except Exception:  # the parser lets its own errors and those of Python through
+        except Exception:  # the parser raises errors of its own and of Python
             return
 
     def knows(self, kind: str, encoding: str) -> bool:
@@ -52,15 +52,15 @@ class Deserialiser:
         return encoding in ENCODINGS and (kind in CUSTOM_MSGS or kind in self._store(encoding).types)
 
     def read(self, data: bytes, kind: str, encoding: str) -> Any:
-        """The message. Raises whatever the library raises for bytes that are no such message."""
+        """The message. Raises whatever the library raises for bytes that are not such a message."""
         if kind in CUSTOM_MSGS:
             return CustomMsg.of(data, encoding)
         store = self._store(encoding)
-        view = memoryview(data)  # the library slices it, which would copy every cloud
+        view = memoryview(data)  # the library slices this; slices of bytes would copy every cloud
         return store.deserialize_ros1(view, kind) if encoding == "ros1" else store.deserialize_cdr(view, kind)
 
     def _store(self, encoding: str) -> Typestore:
-        """Made when it is first needed: importing all types of a ROS takes a tenth of a second."""
+        """The types of an encoding, loaded when first needed, since this takes a tenth of a second."""
         if encoding not in self._stores:
             self._stores[encoding] = get_typestore(_STORES[encoding])
         return self._stores[encoding]
@@ -100,8 +100,8 @@ def cloud_message(scan: Scan, *, exact: bool = False, stamp_ns: int | None = Non
     """A PointCloud2 with the points' absolute times in `timestamp`, in f64 seconds as drivers write them.
 
     Args:
-        exact: the times in int64 ns instead, which loses nothing but is no standard type of a field.
-        stamp_ns: of the message; None: that of the last point. frame: its name.
+        exact: the times in int64 ns instead, which is exact but not a standard type of field.
+        stamp_ns: of the message; None: the time of the last point. frame: name of its frame.
     """
     point = _point_type("<i8" if exact else "<f8", scan.truth_ground is not None)
     points = np.zeros(len(scan), point)
@@ -135,7 +135,7 @@ def points_message(points: npt.NDArray[Any], stamp_ns: int, frame: str) -> Any:
 
 
 def empty_cloud(stamp_ns: int) -> Any:
-    """A PointCloud2 without a point, for a revolution that saw nothing."""
+    """A PointCloud2 without points, for a revolution without returns."""
     return points_message(np.empty(0, _point_type("<i8", False)), stamp_ns, "rslidar")
 
 
@@ -217,7 +217,7 @@ class RecordingWriter:
         self._add(self._others[topic], serialised(message), log_ns)
 
     def flush(self) -> None:
-        """End a chunk, so that what was written can be read even if the end of the file never comes."""
+        """End a chunk, so that everything written so far can be read even if the file is never finished."""
         self._mcap.flush()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
 
     def finish(self) -> None:

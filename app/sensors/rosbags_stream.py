@@ -18,7 +18,7 @@ from app.slam.errors import printable
 from app.slam.types import I64
 
 _PACKED = b"\x28\xb5\x2f\xfd"
-"""How what zstd has compressed begins."""
+"""The first bytes of data compressed by zstd."""
 
 
 class RosbagsStream:
@@ -33,7 +33,7 @@ class RosbagsStream:
     def __init__(self, files: list[Path]) -> None:
         """Raises whatever the library raises for a file that it cannot read."""
         limit_rosbags()
-        self._links = TemporaryDirectory()  # of names that end as rosbags expects
+        self._links = TemporaryDirectory()  # of links whose names end as rosbags expects
         files = [self._in_small_letters(path) for path in files]
         self._standard = Deserialiser()
         self._reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
@@ -49,7 +49,7 @@ class RosbagsStream:
         if self.wild:
             start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns)
         connections = [one for one in self._reader.connections if printable(one.topic) in topics]
-        if not connections:  # which rosbags would take for all of them
+        if not connections:  # rosbags would read all topics then
             return
         for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
             yield printable(connection.topic), log_ns, self._deserialised(raw, connection.msgtype)
@@ -68,7 +68,7 @@ class RosbagsStream:
         return False
 
     def is_unindexed(self) -> bool:
-        """Whether an MCAP does not tell which messages are in a chunk, or of how many on each topic."""
+        """Whether an MCAP does not state which messages a chunk holds, or how many messages each topic has."""
         for chunks in (getattr(file, "chunks", []) for file in self._files()):
             if chunks and not any(chunk.message_index_offsets for chunk in chunks):
                 return True
@@ -76,12 +76,12 @@ class RosbagsStream:
         return held > 0 and not any(count for _, count in self.counts.values())
 
     def is_contradicted(self) -> bool:
-        """Whether a metadata.yaml tells of other messages than its files hold."""
+        """Whether a metadata.yaml states other messages than its files hold."""
         held = chain.from_iterable(file.connections for file in self._files())
         return self._reader.is2 and _counted(self._reader.connections) != _counted(held)
 
     def is_packed(self) -> bool:
-        """Whether messages are compressed one by one, as only a metadata.yaml tells."""
+        """Whether messages are compressed one by one, which only a metadata.yaml states."""
         return any(raw[:4] == _PACKED for _, _, raw in islice(self._reader.messages(), 1))
 
     def close(self) -> None:
@@ -97,7 +97,7 @@ class RosbagsStream:
         return min(start_ns, LATEST_NS), min(end_ns, LATEST_NS), 0
 
     def _log_times(self) -> I64:
-        """Of all messages of bags and databases."""
+        """The log times of all messages of bags and databases."""
         bags = chain.from_iterable(getattr(reader, "indexes", {}).values() for reader in self._reader.readers)
         times = [np.array([entry.time for entry in index], np.int64) for index in bags]
         for file in self._files():
@@ -107,12 +107,12 @@ class RosbagsStream:
         return np.concatenate([np.empty(0, np.int64), *times])
 
     def _files(self) -> Iterator[Any]:
-        """Those of ROS 2, as rosbags has them open."""
+        """The ROS 2 files, as rosbags has them open."""
         for storage in (getattr(reader, "storage", None) for reader in self._reader.readers if self._reader.is2):
             yield from getattr(storage, "storages", [storage])
 
     def _deserialised(self, raw: bytes, kind: str) -> Any:
-        """Read standard types as they are defined, whatever the file states about them."""
+        """The message. Standard types are read by their standard definition, whatever the file states about them."""
         encoding = "cdr" if self._reader.is2 else "ros1"
         if self._standard.knows(kind, encoding):
             return self._standard.read(raw, kind, encoding)
@@ -127,7 +127,7 @@ class RosbagsStream:
 
 
 def _counted(connections: Iterable[Any]) -> Counter[tuple[str, str, str]]:
-    """Messages by topic, type and how they were sent."""
+    """Number of messages by topic, type and encoding."""
     counts: Counter[tuple[str, str, str]] = Counter()
     for one in connections:
         counts[one.topic, one.msgtype, str(one.ext)] += one.msgcount

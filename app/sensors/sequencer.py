@@ -1,9 +1,9 @@
 """Pairs each scan with the IMU samples that cover it, and with the samples of any other sensor.
 
-A recording and a live source use it alike: they call `add_imu`, `add_scan` and `add` in the order of arrival, and
-`ready()` gives what is complete. Pairing goes by the time of measurement, never by arrival. Gaps, repeated samples and
-steps back in time are detected, counted and reported. A scan without samples is used all the same once the IMU has
-covered an earlier one: then the LiDAR alone shows the motion.
+Recordings and live sources use it in the same way: they call `add_imu`, `add_scan` and `add` in the order of arrival,
+and `ready()` returns complete measurements. Pairing goes by the time of measurement, never by arrival. Gaps, repeated
+samples and steps back in time are detected, counted and reported. Once the IMU has covered a scan, later scans without
+samples are used too: then the LiDAR alone shows the motion.
 """
 
 import bisect
@@ -20,33 +20,33 @@ from app.slam.sections import ImuParams
 from app.slam.types import I64, DroppedScan, ImuSamples, Measurement, Samples, Scan, Vector
 
 OUTAGE_NS = 1_000_000_000
-"""The first sample, and the first after a gap, must be confirmed by one that comes within this after it."""
+"""The first sample, and the first after a gap, must be confirmed by another sample within this time."""
 
 MAX_WAITING = 64
-"""Scans that wait for IMU samples at most; bounds the memory when the IMU falls silent."""
+"""Most scans that wait for IMU samples; bounds the memory when the IMU falls silent."""
 
 BLIND_NS = 10_000_000_000
-"""A scan that comes more than this after the one before, beyond the IMU's samples, has a wrong clock."""
+"""If a scan is this much later than the previous one, and beyond the IMU's samples, its clock is wrong."""
 
 MAX_SAMPLES = 100_000
-"""IMU samples that may wait for a scan, eight minutes at 200 Hz: nobody dead-reckons longer than that."""
+"""Most IMU samples that wait for a scan, eight minutes at 200 Hz: dead reckoning is useless for longer."""
 
 MAX_HELD = 10_000
-"""Samples of another sensor that may wait for a scan; the oldest go first."""
+"""Most samples of another sensor that wait for a scan; the oldest are dropped first."""
 
 GYRO, ACCEL = slice(0, 3), slice(3, 6)
 SPIKE_FLOOR = ((GYRO, 0.5), (ACCEL, 3.0))
 """rad/s, m/s^2: a sample that differs less from its neighbours is never a spike."""
 STUCK_SAMPLES = 200
 COARSE = (0.005, 0.05)
-"""rad/s, m/s^2: in steps larger than this, an IMU at rest reads the same number for long, and nothing is stuck."""
+"""rad/s, m/s^2: an IMU with a coarser resolution than this reads the same number for long at rest and is not stuck."""
 SPIKE_TO_NEIGHBOURS, SPIKE_TO_USUAL = 4.0, 10.0
 """A spike deviates from the line between its neighbours by this many times their difference and the usual deviation."""
 
 
 @dataclass(slots=True)
 class Counts:
-    """What the sequencer has counted."""
+    """Counts of the sequencer."""
 
     imu_duplicates: int = 0
     imu_back_steps: int = 0
@@ -64,12 +64,12 @@ class Counts:
 
 @dataclass(slots=True)
 class Sequencer:
-    """The one place that gives a scan the IMU samples that cover it, and only those that an IMU can have measured.
+    """The only place that pairs a scan with the IMU samples that cover it. Implausible samples are left out.
 
     Attributes:
         limits: `max_gap`: a longer interval between IMU samples is a gap, and reported. `max_rate`,
             `max_acceleration`: samples beyond are refused.
-        without_imu: there is no IMU: scans go out as they come, without samples.
+        without_imu: if there is no IMU, scans go out as they come, without samples.
         counts: gaps, repeated samples and the like.
     """
 
@@ -87,9 +87,9 @@ class Sequencer:
     _behind: bool = False
     _told_gap_ns: int = -1
     _told_silence_ns: int = -1
-    """Last sample before the gap, and before the silence without an end, that was told last."""
+    """Stamps of the last sample before the gap, and before the ongoing silence, that were reported last."""
     _suspect: tuple[int, tuple[float, ...]] | None = None
-    """The first sample, or the first after a gap: a wrong stamp, unless the next goes on from it."""
+    """The first sample, or the first after a gap. Its stamp counts as wrong unless the next sample follows it."""
     _usual: list[float] = field(default_factory=lambda: [0.0, 0.0])
     """How far samples usually are from the line between their neighbours: rad/s, m/s^2."""
     _begun: bool = False
@@ -103,7 +103,7 @@ class Sequencer:
         return replace(self, **{column.name: copy(getattr(self, column.name)) for column in fields(self)})
 
     def tail(self) -> "Sequencer":
-        """A sequencer that takes over after this one's last scan, and notices what is missing in between."""
+        """A sequencer that takes over after this one's last scan, and reports what is missing in between."""
         return replace(
             self.copy(),
             _stamps=self._stamps[-1:],
@@ -179,7 +179,7 @@ class Sequencer:
             self.counts.longest_imu_gap_s = max(self.counts.longest_imu_gap_s, gap_s)
 
     def _note_stuck_axes(self, values: tuple[float, ...]) -> None:
-        """An axis with noise never reads the same number for long, unless its steps hide the noise."""
+        """Report stuck axes. An axis never reads the same number for long, unless its resolution hides the noise."""
         if not self._values:
             return
         for axis, (last, value) in enumerate(zip(self._values[-1], values, strict=True)):
@@ -195,7 +195,7 @@ class Sequencer:
                 self._notices.append(f"the {name} has read the same number for {STUCK_SAMPLES} samples: it is stuck")
 
     def _check(self, before: int, this: int, after: int) -> None:
-        """Take out this sample if it differs from its neighbours as no motion does: for a single sample."""
+        """Remove this sample if it alone differs from its neighbours: no motion lasts only one sample."""
         values, spike = self._values, False
         for n, (part, floor) in enumerate(SPIKE_FLOOR):
             first, second, third = values[before][part], values[this][part], values[after][part]
@@ -210,20 +210,20 @@ class Sequencer:
             self._count("imu_spikes", "an IMU sample is far from those before and after it and was left out")
 
     def notice(self, text: str) -> None:
-        """Something to tell with the next measurement."""
+        """Report this text with the next measurement."""
         self._notices.append(text)
 
     def add(self, samples: Samples) -> None:
         """Samples of any other sensor. Each goes out once, with the first measurement that ends at or after it.
 
-        A sample that arrives too late for that goes out with the next one.
+        A sample that arrives too late goes out with the next measurement.
         """
         kind = type(samples)
         held = _joined(self._held[kind], samples) if kind in self._held else samples
         self._held[kind] = _rows(held, slice(-MAX_HELD, None))
 
     def add_scan(self, scan: Scan | DroppedScan) -> None:
-        """One scan, or the news that one could not be read (it keeps its place in the sequence)."""
+        """One scan, or the notice that one could not be read, which keeps its place in the sequence."""
         bisect.insort(self._waiting, scan, key=lambda waiting: waiting.stamp_ns)
 
     @property
@@ -238,15 +238,15 @@ class Sequencer:
 
     @property
     def silent_s(self) -> float:
-        """For how long there have been IMU samples and no scan."""
+        """For how long there have been IMU samples but no scan."""
         return (self._stamps[-1] - self._last_end_ns) / 1e9 if self._stamps and self._last_end_ns is not None else 0.0
 
     def ready(self, most_waiting: int = MAX_WAITING) -> Iterator[Measurement | DroppedScan]:
-        """What the samples so far complete, in order of time.
+        """The measurements that are complete by now, in order of time.
 
         Args:
-            most_waiting: scans that may wait for samples; of more, the oldest go out without. At least 1 while scans
-                come, since a later one may arrive first.
+            most_waiting: scans that may wait for samples; if there are more, the oldest go out without samples. At
+                least 1 while scans come, since a later scan may arrive first.
         """
         most = min(most_waiting, 1) if self.without_imu else most_waiting
         while self._waiting:
@@ -258,7 +258,7 @@ class Sequencer:
             yield self._take(self._waiting.pop(0))
 
     def finish(self) -> Iterator[Measurement | DroppedScan]:
-        """The input is over: what still waits."""
+        """The input has ended: the measurements that are still waiting."""
         yield from self.ready(0)
         if self._stamps and self._last_end_ns is not None:
             self._count_gap(self._stamps[-1], self._last_end_ns)
@@ -319,7 +319,7 @@ class Sequencer:
         return ""
 
     def _tell_gaps(self, stamps_ns: I64, end_ns: int) -> None:
-        """Each gap is told once, with the first scan that knows its end."""
+        """Report each gap once, with the first scan by which its end is known."""
         if self.without_imu:
             return
         gaps = np.diff(stamps_ns) > self.limits.max_gap * 1e9

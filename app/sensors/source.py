@@ -1,4 +1,4 @@
-"""Recording files as a stream of messages, and each of their failures as one clear sentence."""
+"""Recording files as a stream of messages. Each failure becomes one clear sentence."""
 
 import re
 from collections.abc import Iterator
@@ -45,7 +45,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A message that was read: how many were read up to it, its log time, and how many of them share that time."""
+    """The place of a message: how many were read up to it, its log time, and how many of these share that time."""
 
     read: int
     log_ns: int
@@ -61,7 +61,7 @@ class Mark:
 
 Stream = RosbagsStream | McapStream | CaptureStream | OusterStream
 """One kind of file, opened. `counts`: topic -> (type, number of messages). `start_ns`, `end_ns`: log times of the first
-and last message. `by_log_time`: whether messages come sorted by log time. `wild`: of how many they are wrong."""
+and last message. `by_log_time`: whether messages come sorted by log time. `wild`: how many have a wrong log time."""
 
 
 class Source(AbstractContextManager["Source"]):
@@ -69,15 +69,15 @@ class Source(AbstractContextManager["Source"]):
 
     Attributes:
         path: as given. topics: by name. start_ns, end_ns: log times of the first and last message.
-        findings: what is unusual about the file and was overcome.
+        findings: unusual properties of the file that were overcome.
         first_scan_ns: log time from which `--duration` counts; the first message's until a reader knows better.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open.
+        """Open a file or folder.
 
         Raises:
-            HemislamError: missing, empty, cut, foreign, corrupt or unindexed file.
+            HemislamError: the file is missing, empty, truncated, corrupt, without an index, or of another kind.
         """
         self.path = path
         self._stream, self.findings = _open(path)
@@ -103,10 +103,10 @@ class Source(AbstractContextManager["Source"]):
         """(topic, log time ns, deserialised message) of these topics, logged within [start, stop).
 
         Args:
-            after: the last message of an earlier call with the same arguments; this one goes on from there.
+            after: the last message of an earlier call with the same arguments; this call continues from there.
 
         Raises:
-            HemislamError: the file is damaged here; everything before was given.
+            HemislamError: the file is damaged here; all earlier messages have been given.
         """
         first, stop = start_ns or 0, LATEST_NS + 1 if stop_ns is None else stop_ns
         known = 0
@@ -117,7 +117,7 @@ class Source(AbstractContextManager["Source"]):
         while True:
             try:
                 entry = next(stream, None)
-            except Exception as error:  # rosbags lets those of zstd, lz4, sqlite, struct and asserts through
+            except Exception as error:  # rosbags lets errors of zstd, lz4, sqlite, struct and assert pass
                 at = (log_ns - self.start_ns) / 1e9
                 advice = _repair(self.path)
                 usable = (log_ns - self.first_scan_ns - LOG_MARGIN_NS) / 1e9 - 0.5
@@ -134,7 +134,7 @@ class Source(AbstractContextManager["Source"]):
             yield entry
 
     def lacks(self, topics: tuple[str, ...], read: int) -> bool:
-        """Whether so many messages of these topics, read from begin to end, are fewer than the file's index tells."""
+        """Whether `read` messages, from a complete reading of these topics, are fewer than the file's index states."""
         return read < sum(topic.messages for topic in self.topics if topic.name in topics) - self._stream.wild
 
     def close(self) -> None:
@@ -179,7 +179,7 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
 
 
 def _read_by_rosbags(path: Path, files: list[Path]) -> tuple[RosbagsStream, tuple[Finding, ...]]:
-    """The files; those of a folder whose metadata.yaml is wrong without that. Raises whatever the library raises."""
+    """The files as a stream; a wrong metadata.yaml of a folder is ignored. Raises whatever the library raises."""
     stream: RosbagsStream | Exception
     try:
         stream, why = RosbagsStream(files), "it tells of other messages than the files hold"
@@ -265,7 +265,7 @@ def _refusal(path: Path, error: Exception) -> str:
 
 
 def _recording_files(path: Path) -> list[Path]:
-    """The files that rosbags is given for this path; refuses what is clearly no recording."""
+    """The files to give to rosbags for this path; refuses what is clearly not a recording."""
     try:
         if not path.exists():
             raise HemislamError(f"There is no recording {path}; check the path.")
