@@ -1,7 +1,7 @@
-"""When each point was measured: in which field, in which unit, counted from what.
+"""When each point was measured: the field of its time, the unit, and the moment from which it counts.
 
 A wrong answer here does not crash anything; it bends every scan, and the map drifts silently. So each choice is checked
-against what must hold: a scan lasts about as long as the interval to the next one, and no point was measured after its
+against two facts: a scan lasts about as long as the interval to the next one, and no point was measured after its
 message was logged.
 """
 
@@ -17,10 +17,10 @@ from app.slam.sections import RecordingParams
 from app.slam.types import I64
 
 LONGEST = 5.0
-"""Intervals that a scan may last: more than one where several LiDARs send on one topic, which `clocks.py` reports."""
+"""Most intervals that a scan may last: over one if several LiDARs send on one topic, which `clocks.py` reports."""
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 MOST_NS = 2**61
-"""Later times, 73 years after others, are cut to this, so that integers hold them."""
+"""Times more than 73 years after others are limited to this, so that integers can hold them."""
 
 Anchor = Literal["absolute", "header", "first", "last"]
 End = Literal["first", "last"]
@@ -87,7 +87,7 @@ def _settle_unit(
 ) -> tuple[int, str, Finding]:
     """ns in one unit of this field; why it cannot be the points' time, "" if it can; the finding.
 
-    A unit that the user chose is kept even where it does not fit: a finding then, not a problem.
+    A unit that the user chose is kept even if it does not fit; this is then a finding, not a problem.
     """
     columns = [probe.column(name) for probe in clouds]
     first = columns[0]
@@ -121,7 +121,7 @@ def _settle_unit(
 def _settle_reference(
     name: str, unit_ns: int, clouds: list[Probe], chosen: RecordingParams, period_ns: int
 ) -> tuple[Timing, list[Finding]]:
-    """What the field counts from, and which point the header belongs to."""
+    """The moment from which the field counts, and the point to which the header stamp belongs."""
     times = [exact_ns(probe.column(name), unit_ns) for probe in clouds]
     least = [base + int(after.min()) for base, after in times]
     most = [base + int(after.max()) for base, after in times]
@@ -129,7 +129,7 @@ def _settle_reference(
     to_first = float(np.median([s - t for s, t in zip(stamps, least, strict=True)]))
     to_last = float(np.median([s - t for s, t in zip(stamps, most, strict=True)]))
     near = min(abs(to_first), abs(to_last)) < max(2e9, 3 * period_ns)
-    # The clock of a simulator starts at zero, so it is small at first, but it runs on with the headers.
+    # The clock of a simulator starts at zero, so its times are small at first, but they advance with the headers.
     elapsed = stamps[-1] - stamps[0]
     runs_on = elapsed > 0 and abs(least[-1] - least[0] - elapsed) < 0.5 * elapsed
     small = max(abs(min(least)), abs(max(most))) < 3 * period_ns and not runs_on
@@ -178,7 +178,7 @@ def _absolute_findings(
 def _settle_header(
     clouds: list[Probe], least: list[int], most: list[int], period_ns: int, chosen: RecordingParams
 ) -> tuple[End, Finding]:
-    """Which point the header belongs to."""
+    """The point to which the header stamp belongs."""
     if chosen.header_stamp != "auto":
         return _header(chosen.header_stamp, "as you set it", "fine")
     duration = float(np.median([m - i for i, m in zip(least, most, strict=True)]))
@@ -215,7 +215,7 @@ def _header(end: End, evidence: str, verdict: FindingVerdict) -> tuple[End, Find
 
 
 def log_delay_ns(clouds: list[Probe]) -> float | None:
-    """Median of log time minus header stamp; None if it is no evidence (equal, or unrelated clocks)."""
+    """Median of log time minus header stamp; None if this is not evidence (copied stamps, or unrelated clocks)."""
     if not clouds[0].stamped:
         return 0.0
     delays = np.array([probe.log_ns - probe.cloud.stamp_ns for probe in clouds], np.float64)

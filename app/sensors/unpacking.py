@@ -15,7 +15,7 @@ import rosbags.rosbag2.storage_mcap
 import zstandard
 
 LIMIT: Final = 256 << 20
-"""Bytes of a chunk, or of a message that is compressed on its own. Writers make chunks of about 1 MB."""
+"""Most bytes of a chunk, or of a message that is compressed on its own. Writers make chunks of about 1 MB."""
 
 
 class TooLarge(ValueError):
@@ -47,7 +47,7 @@ def unpack_bz2(data: bytes) -> bytes:
 
 
 UNPACK: Final = {"zstd": unpack_zstd, "lz4": unpack_lz4}
-"""By the name that an MCAP gives to a compression."""
+"""Functions by the names that MCAP gives to compressions."""
 
 
 def _checked(data: bytes, size: int) -> bytes:
@@ -80,7 +80,7 @@ class _LimitedFile:
 
 
 def limit_rosbags() -> None:
-    """Let rosbags unpack by the functions above: it has no option for a limit."""
+    """Make rosbags use the functions above: it has no option for a limit."""
     rosbags.rosbag1.reader.decompressors |= {"bz2": unpack_bz2, "lz4": unpack_lz4}
     rosbags.rosbag2.storage_mcap.DECOMPRESSORS |= {"lz4": unpack_lz4, "zstd": unpack_zstd}
     limited: Any = SimpleNamespace(decompress=unpack_zstd, open=lambda file, mode: _LimitedFile(file))

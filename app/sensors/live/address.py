@@ -1,4 +1,4 @@
-"""Where the receiving process of a live source is polled."""
+"""The address at which the receiving process of a live source is polled."""
 
 import contextlib
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ class LiveAddress:
     key: bytes
 
     def end(self, reason: str) -> None:
-        """Say that nothing will answer there any more. The first reason counts."""
+        """Record that nothing will answer at this address any more. The first reason counts."""
         with contextlib.suppress(OSError), Path(f"{self.path}.ended").open("x", encoding="utf-8") as file:
             file.write(reason)
 
     def ended(self) -> str:
-        """Why nothing will answer there any more; "" while something may."""
+        """Why nothing will answer at this address any more; "" while something may."""
         try:
             return Path(f"{self.path}.ended").read_text(encoding="utf-8") or ENDED
         except OSError:

@@ -1,7 +1,7 @@
 """A network capture as a recording: a sensor's packets and `imu-udp` datagrams of a .pcap or .pcapng.
 
 Opening reads the file once and notes where each scan was complete, so that reading can begin near any time. The packets
-are recognised by their content, whatever their ports. Those of a second LiDAR are left out.
+are recognised by their content, whatever their ports. Packets of a second LiDAR are left out.
 """
 
 import bisect
@@ -36,33 +36,34 @@ from app.slam.types import I64, Scan
 
 SUFFIXES = (".pcap", ".pcapng")
 _COMPARED = 1_000
-"""Packets of measurements, half a second of a sensor, that settle which of several LiDARs is read; and messages that
-settle whether two clocks agree."""
+"""Number of measurement packets (half a second) that decide which of several LiDARs is read, and number of messages
+that decide whether two clocks agree."""
 _RUN_IN = 2
-"""Reading begins where this many scans earlier was complete: all packets of the wanted one lie behind that."""
+"""Reading begins at the place where the scan this many earlier was complete, which is before all packets of the wanted
+scan."""
 
 _FAR_NS = 1 << 62
-"""The year 2116; later stamps are cut to it, so that integers hold them."""
+"""The year 2116; later stamps are limited to it, so that integers can hold them."""
 
 _WILD_NS = 10_000_000_000
-"""A log time that is further from those around it is not that of its packet."""
+"""A log time that is farther than this from those around it is wrong."""
 
 V = TypeVar("V")
 Shifts = list[tuple[int, int]]
-"""From which log time on how many ns are added to a sensor's stamps."""
+"""Log times, each with the ns that are added to a sensor's stamps from then on."""
 
 
 class PacketStream(ABC):
-    """What captures of every LiDAR have in common; see `app.sensors.source.Stream`.
+    """The common part of the captures of all LiDARs; see `app.sensors.source.Stream`.
 
-    A content is what packets give once they are complete: all packets of a scan, an IMU sample, or a sensor's settings.
+    Packets are combined into contents: all packets of a scan, an IMU sample, or a sensor's settings.
 
     Args:
-        is_measured: whether a packet holds measurements of such a LiDAR. topics: by the type of a content; others are
-            no messages.
+        is_measured: whether a packet holds measurements of such a LiDAR. topics: by the type of a content; contents of
+            other types give no messages.
 
     Attributes:
-        complete: whether the file has its end. findings: what the packets are, and what was lost of them.
+        complete: whether the file has its end. findings: the kinds of packets, and how many were lost.
     """
 
     by_log_time, wild = True, 0
@@ -70,10 +71,10 @@ class PacketStream(ABC):
     findings: tuple[Finding, ...]
 
     def __init__(self, path: Path, is_measured: Callable[[bytes], bool]) -> None:
-        """Raises CaptureError: it is no capture."""
+        """Raises CaptureError: the file is not a capture."""
         self._path, self._capture, self._is_measured = path, Capture(path), is_measured
         senders = (one.sender for one in self._capture.datagrams() if is_measured(one.payload))
-        most = Counter(islice(senders, _COMPARED)).most_common(1)  # of equals, the first
+        most = Counter(islice(senders, _COMPARED)).most_common(1)  # in a tie, the first
         self._sender = most[0][0] if most else None
         self._other_senders: set[bytes] = set()
         self._complete_at: list[tuple[int, CapturePlace]] = []
@@ -97,14 +98,14 @@ class PacketStream(ABC):
 
     @abstractmethod
     def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[Any]:
-        """What these complete. datagrams: each with its log time, which never steps back."""
+        """The contents that these datagrams complete. datagrams: each with its log time, which never steps back."""
 
     @abstractmethod
     def _message(self, content: Any, log_ns: int) -> Any:
         """The content as a message of its topic."""
 
     def _index(self, scans: type) -> Iterator[tuple[int, Any]]:
-        """Log time and content of the first reading, which finds start, end, and where the scans are complete."""
+        """Log times and contents of the first reading, which finds start and end, and where scans are complete."""
         for log_ns, place, content in self._read(None, 0):
             if type(content) in self._topics:
                 self.start_ns = self.start_ns or log_ns
@@ -115,7 +116,7 @@ class PacketStream(ABC):
         self.complete = self._capture.complete
 
     def _read(self, place: CapturePlace | None, running_ns: int) -> Iterator[tuple[int, CapturePlace, Any]]:
-        """Log time, place in the file, and what was complete there; from a place on, or all.
+        """Log time, place in the file, and the content that was complete there; from a place on, or all.
 
         running_ns: the newest log time before that place.
         """
@@ -131,7 +132,7 @@ class PacketStream(ABC):
             yield running_ns, at, content
 
     def _is_of_another(self, datagram: Datagram) -> bool:
-        """Whether it comes from another address than the LiDAR's. Other LiDARs are noted."""
+        """Whether a datagram comes from another address than the LiDAR's. Other LiDARs are noted."""
         if datagram.sender == self._sender:
             return False
         if self._is_measured(datagram.payload):
@@ -139,7 +140,7 @@ class PacketStream(ABC):
         return True
 
     def _senders_finding(self) -> list[Finding]:
-        """Which of several LiDARs is read, and how to read another."""
+        """The finding on which of several LiDARs is read, and how to read another one."""
         if self._sender is None or not self._other_senders:
             return []
         used, left_out = (
@@ -230,7 +231,7 @@ class CaptureStream(PacketStream):
         yield from order.flush()
 
     def _take_stock(self) -> None:
-        """The first reading: times of all messages, what the device says, what is lost."""
+        """Read the file for the first time: times of all messages, what the device states, what is lost."""
         lidar, of_imus = array("q"), {False: array("q"), True: array("q")}
         for log_ns, content in self._index(Revolution):
             if isinstance(content, Difop):
@@ -248,7 +249,7 @@ class CaptureStream(PacketStream):
         self._settle_clocks(frames, samples)
 
     def _settle_clocks(self, frames: I64, samples: I64) -> None:
-        """The sensors' own clocks if they agree, else the host's; steps of a clock are taken out.
+        """Use the sensors' own clocks if they agree, else the host's clock; remove steps of a clock.
 
         Args:
             frames, samples: (n, 2) stamp and log time.
@@ -309,10 +310,10 @@ class CaptureStream(PacketStream):
 
 
 def _without_wild_times(datagrams: Iterator[Datagram], before_ns: int) -> Iterator[tuple[int, Datagram]]:
-    """Each with its log time, or that of a neighbour if it is far from both of them.
+    """Each datagram with its log time, or with that of a neighbour if its own is far from both neighbours'.
 
     Args:
-        before_ns: the log time before the first; 0: there is none, and the two after it are compared.
+        before_ns: the log time before the first; 0: none, so the first is compared with the two after it.
     """
     ahead = deque(islice(datagrams, 2))
     while ahead:
@@ -325,7 +326,7 @@ def _without_wild_times(datagrams: Iterator[Datagram], before_ns: int) -> Iterat
 
 
 def _value_at(rows: list[tuple[int, V]], log_ns: int) -> V:
-    """The value that holds at a log time; before the first, the first."""
+    """The value in force at a log time; before the first one, the first value."""
     return rows[max(bisect.bisect_right(rows, log_ns, key=lambda row: row[0]) - 1, 0)][1]
 
 

@@ -1,10 +1,10 @@
-"""The clocks of live sensors, mapped onto one time that goes on steadily even when a clock is set."""
+"""The clocks of live sensors, mapped onto one time that stays continuous even when a clock is set."""
 
 from collections import deque
 from dataclasses import dataclass, field
 
 JUMP_NS = 500_000_000
-"""A stamp this much out of step with the one before means that the clock was set."""
+"""If a stamp steps back by this much, or runs ahead of its arrival by this much, the clock was set."""
 _WINDOW_NS = 10_000_000_000
 _SLEW = 1e-3
 """Largest change of the shift per host time; clocks drift a hundred times more slowly."""
@@ -15,7 +15,7 @@ class ClockMap:
     """Maps one sensor's stamps onto the time that the engine gets.
 
     Attributes:
-        host: map onto the host's clock (for sensors that have no date, or drift), not the sensor's own.
+        host: map onto the host's clock (for sensors that have no date, or drift), not onto the sensor's own clock.
         shift_ns: added to stamps at present. jump_ns: by how much the clock was last set, and jumped_at_ns:
             when, by the host's clock.
     """
@@ -36,7 +36,7 @@ class ClockMap:
         return stamp < -JUMP_NS or (stamp > JUMP_NS and stamp - arrival > JUMP_NS)
 
     def map(self, stamp_ns: int, arrival_ns: int, other: "ClockMap | None" = None) -> int:
-        """The stamp in the engine's time, from which jumps are taken out.
+        """The stamp in the engine's time, in which jumps are removed.
 
         Args:
             other: the map of another sensor; if its clock jumped at the same time by as much, they share a clock.
@@ -55,7 +55,7 @@ class ClockMap:
         return stamp_ns + self.shift_ns
 
     def _follow(self, stamp_ns: int, arrival_ns: int) -> None:
-        """Follow the host's clock by the least delay of the last seconds, which is that of transport alone."""
+        """Follow the host's clock by the smallest delay of the last seconds, which is due to transport alone."""
         delay = arrival_ns - stamp_ns
         delays = self._delays
         if not delays:
@@ -77,9 +77,9 @@ class ClockMap:
 
 @dataclass(slots=True)
 class OffsetEstimate:
-    """By how much the IMU's stamps lag behind the LiDAR's, judged by what arrived at the same moment.
+    """How far the IMU's stamps lag behind the LiDAR's, estimated from data that arrived at the same moment.
 
-    It does not depend on the speed at which a recording is played. Its error is the drivers' delays.
+    The estimate does not depend on the speed at which a recording is played. Its error is the drivers' delays.
     """
 
     _imu: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=2_000))

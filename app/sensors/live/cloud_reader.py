@@ -28,12 +28,12 @@ class CloudReader:
         self._reported = ""
 
     def add(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
-        """The scans that this message completes, each with its arrival: none at first, then those that waited.
+        """The scans that are ready after this message, each with its arrival: none at first, then all that waited.
 
-        How clouds are read, and why they cannot be, is reported to the intake.
+        How clouds are read, or why they cannot be read, is reported to the intake.
 
         Args:
-            message: deserialised. log_ns: when its sender passed it on.
+            message: deserialised. log_ns: the time at which its sender passed it on.
         """
         try:
             return self._read(message, log_ns, arrival_ns, intake)
@@ -45,7 +45,7 @@ class CloudReader:
             return []
 
     def _read(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
-        """Raises HemislamError: such clouds cannot be read at all, and why."""
+        """As `add`. Raises HemislamError, with the reason, if such clouds cannot be read at all."""
         if self._layout is not None:
             cloud, scan = read_scan(message, log_ns, self._layout)
             if cloud is None or cloud.fields == self._fields:

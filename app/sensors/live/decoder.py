@@ -11,15 +11,15 @@ from app.slam.errors import HemislamError
 from app.slam.types import F64, U16, DroppedScan, Scan
 
 MIN_RANGE_M, MAX_RANGE_M = 0.1, 150.0
-"""A distance outside these is no return."""
+"""m: a distance outside these is not a return."""
 
 
 class Decoder:
     """Decodes revolutions of one sensor.
 
     Attributes:
-        calibration: in use: that of a file, else the device's own, else the nominal one.
-        difop: the device's settings. bad_blocks: without their mark or azimuth.
+        calibration: the one in use: from a file, else the device's own, else the nominal one.
+        difop: the device's settings. bad_blocks: number of blocks without their mark or azimuth.
     """
 
     def __init__(self, angles: ChannelAngles | None = None, model: Model = BPEARL) -> None:
@@ -79,7 +79,7 @@ class Decoder:
         return Scan(base_ns + earliest, points[:n].copy(), offsets_ns, intensity[:n].copy(), ring[:n].copy())
 
     def _step(self, frame: Revolution, model: Model) -> float:
-        """0.01 deg from block to block: the median, or what follows from the stated speed."""
+        """Azimuth from block to block, 0.01 deg: the median, or computed from the stated speed."""
         at = HEADER_BYTES + 2 + model.parts * model.part_bytes * np.arange(model.blocks)
         azimuth = (frame.packets[:, at].astype(np.int64) << 8) | frame.packets[:, at + 1]
         step = (np.diff(azimuth, axis=1) + TURN // 2) % TURN - TURN // 2

@@ -20,9 +20,9 @@ class Device:
     """A LiDAR that sends packets.
 
     Attributes:
-        models: that send the same packets. ports: by default, of measurements, then of the others.
+        models: models with the same packets. ports: defaults, for measurements, then for other packets.
         layout: topics and type of its clouds, as its ROS driver names them. has_imu: whether it sends IMU samples.
-        has_angles: whether its channels have directions of their own, which it states once a second.
+        has_angles: whether each unit has channel directions of its own, which it states once a second.
     """
 
     models: tuple[Model | Livox, ...]
@@ -41,7 +41,7 @@ DEVICES = {
     "airy": Device((AIRY,), (MSOP_PORT, DIFOP_PORT, AIRY_IMU_PORT), ros.AIRY_LAYOUT),
     "mid360": Device((MID360,), (POINTS_PORT, IMU_PORT), ros.MID360_LAYOUT, has_angles=False),
 }
-"""By the scheme of their addresses."""
+"""Devices by the scheme of their addresses."""
 
 
 def device_of(packets: Iterable[bytes]) -> Device | None:
@@ -52,7 +52,7 @@ def device_of(packets: Iterable[bytes]) -> Device | None:
 
 
 def mount_finding(T_imu_lidar: F64) -> Finding:
-    """The mount that a unit reports, and how to use it. T_imu_lidar: (4, 4), m."""
+    """The finding on the mounting that a unit reports, and how to use it. T_imu_lidar: (4, 4), m."""
     place = ", ".join(f"{x:.5f}" for x in T_imu_lidar[:3, 3])
     angles = ", ".join(f"{angle:.2f}" for angle in lie.rpy_degrees(T_imu_lidar[:3, :3]))
     option = f"--set 'sensor.translation=[{place}]' --set 'sensor.rotation=[{angles}]'"

@@ -79,7 +79,7 @@ class Difop:
 
 
 def read_difop(packet: bytes, model: Model = BPEARL) -> Difop | None:
-    """What a packet of this model states; None if it is no DIFOP packet."""
+    """The content of a packet of this model; None if it is not a DIFOP packet."""
     if len(packet) != PACKET_BYTES or packet[:8] != DIFOP_ID:
         return None
     rpm, begin, end = (int(struct.unpack_from(">H", packet, at)[0]) for at in (8, 32, 34))
@@ -126,7 +126,7 @@ def read_angles(path: Path) -> ChannelAngles:
     """A calibration from CSV: a line for each channel, `elevation, horizontal correction` in degrees.
 
     Raises:
-        HemislamError: the file cannot be read, or is no calibration.
+        HemislamError: the file cannot be read, or is not a calibration.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -146,7 +146,7 @@ def read_angles(path: Path) -> ChannelAngles:
 
 
 def _angles_at(model: Model) -> tuple[int, int]:
-    """Where elevations and horizontal corrections begin."""
+    """Offsets in the packet at which elevations and horizontal corrections begin."""
     return _ANGLES_AT, _ANGLES_AT + 3 * model.channels
 
 
@@ -166,7 +166,7 @@ def _write_angles(packet: bytearray, at: int, angles_deg: F64) -> None:
 
 
 def _read_pose(packet: bytes) -> F64 | None:
-    """(4, 4) T_imu_lidar; None where the numbers are no pose within a sensor."""
+    """(4, 4) T_imu_lidar; None if the numbers cannot be a pose within a sensor."""
     *quaternion, x, y, z = _POSE.unpack_from(packet, _POSE_AT)
     if not abs(np.linalg.norm(quaternion) - 1.0) < 0.01 or not np.abs([x, y, z]).max() < 1.0:
         return None

@@ -43,7 +43,7 @@ _FITTED = 5
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """Something to be sent: when, by the sensor's clock, on which stream, what."""
+    """Data to be sent: the time by the sensor's clock, the stream, and the content."""
 
     time_ns: int
     stream: int
@@ -52,9 +52,9 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast to play. speed: times real time, inf: at once. stop: set it to end early.
+    """How fast to play. speed: in multiples of real time; inf: at once. stop: set this to end early.
 
-    progress: called with the seconds of the recording that were played.
+    progress: called with the seconds of the recording that have been played.
     """
 
     speed: float = 1.0
@@ -66,7 +66,7 @@ class _Sensor:
     """A LiDAR that sends what a recording holds.
 
     Attributes:
-        add, flush: packets that a scan completes, and of the remaining points, each with its time.
+        add, flush: give the packets that a scan completes, and those of the remaining points, each with its time.
     """
 
     def __init__(self, recording: Recording, model: Model | Livox, angles: ChannelAngles | None, pose: F64 | None):
@@ -91,11 +91,11 @@ class _Sensor:
         self.add, self.flush = add, packets.flush
 
     def settings(self, stamp_ns: int) -> bytes | None:
-        """The packet in which it states them, if it does."""
+        """The packet in which the sensor states its settings, if it does."""
         return None if isinstance(self._model, Livox) else write_difop(self._difop, stamp_ns, self._model)
 
     def imu(self, sample: ImuSample) -> bytes:
-        """The sample as its own IMU sends it, or one beside it."""
+        """The sample as the sensor's own IMU, or a separate one, sends it."""
         if isinstance(self._model, Livox):
             return livox_udp.write_imu(sample.stamp_ns, sample.gyro, sample.accel, sample.number or 0)
         return write_airy_imu(sample) if self._model is AIRY else write_imu(sample)
@@ -124,7 +124,7 @@ def packets_of(
     stated_ns = shift_ns = before_ns = end_ns = 0
 
     def packets(made: list[tuple[int, bytes]]) -> list[Sent]:
-        """Those of a scan, and of the end of the one before, which ended at `before_ns` and may have a wrong stamp."""
+        """Packets of a scan and of the previous one's end, which was at `before_ns` and may have a wrong stamp."""
         last_ns = end_ns + _AFTER_NS
         return [Sent(min(max(time_ns + shift_ns, before_ns), last_ns), LIDAR, packet) for time_ns, packet in made]
 
@@ -166,7 +166,7 @@ def feed(
     pace: Pace | None = None,
     duration_s: float | None = None,
 ) -> int:
-    """Play a recording to its end, as a Foxglove server once a client subscribes; returns how much was sent.
+    """Play a recording to its end (as a Foxglove server: once a client subscribes). Returns how much was sent.
 
     Raises:
         HemislamError: the recording cannot be read, or not be played in this way.
@@ -228,7 +228,7 @@ def _feed_foxglove(path: Path, topics: tuple[str, ...], to: Address, pace: Pace,
 
 
 def _paced(items: Iterator[Sent], pace: Pace) -> Iterator[Sent]:
-    """Each item at its time. Late ones at once, so that a delay does not slow down all that follows."""
+    """Each item at its time. Late items follow at once, so that one delay does not slow down everything after it."""
     begin: tuple[float, int] | None = None
     reported = -1.0
     for item in items:

@@ -1,8 +1,8 @@
 """From a scan back to the firings that measured it, so that a recording can be played as packets.
 
-A packet has no coordinates, only an azimuth for every block and a distance for every channel; so the points must lie on
-the rays of such a sensor. Those of a recording do once its unit's angles are known, which `fit_angles` reads from a few
-scans.
+A packet has no coordinates, only an azimuth for every block and a distance for every channel. So the points must lie on
+the rays of such a sensor. The points of a recording do, once the angles of its unit are known, which `fit_angles`
+estimates from a few scans.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from app.slam.types import F64, I64, Scan
 
 _CENTI = 100.0
 MISFIT_M = 0.05
-"""If 5 of 100 points are farther than this from their rays, they are not of this sensor."""
+"""If 5 of 100 points are farther than this from their rays, the scan is from another sensor."""
 _CUT_DEG = 4.0
-"""Scans that seem to begin at most this much before azimuth 0 begin at 0, and the angles are off by as much."""
+"""If scans seem to begin at most this much before azimuth 0, they begin at 0, and the angles are off by as much."""
 _CUT_BLOCKS = 2
 """Ends of a scan at most this far beyond azimuth 0 are moved into the revolution."""
 _LEAST_TURN_DEG = 30.0
@@ -27,7 +27,7 @@ _LEAST_TURN_DEG = 30.0
 
 
 def firings_of(scan: Scan, calibration: ChannelAngles = NOMINAL, model: Model = BPEARL, rate_hz: int = 10) -> Firings:
-    """The blocks that give this scan: all from its first to its last, also those without a return.
+    """The blocks of this scan: all from its first to its last, including those without a return.
 
     Raises:
         HemislamError: its points do not lie on the rays of such a sensor.

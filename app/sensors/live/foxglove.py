@@ -27,9 +27,9 @@ SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.
 MAX_MESSAGE = 256 << 20
 RETRY_S = 1.0
 _MOST_DELAY_NS = 800_000_000
-"""Of a network; log times that are older are not trusted."""
+"""Largest delay of a network; older log times are not trusted."""
 _FAR_NS = 1 << 62
-"""The year 2116; a later log time is none."""
+"""The year 2116; a later log time is ignored."""
 MESSAGE = struct.Struct("<BIQ")
 
 Sensor = Literal["lidar", "imu"]
@@ -38,7 +38,7 @@ NAMES: dict[Sensor, Literal["LiDAR", "IMU"]] = {"lidar": "LiDAR", "imu": "IMU"}
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """What a server announces. type: as in ROS 2. definition: the type's text."""
+    """A channel that a server announces. type: as in ROS 2. definition: the type's text."""
 
     id: int
     topic: str
@@ -107,7 +107,7 @@ class FoxgloveReceiver:
                     self._receive(*self._subscribed[number], message[MESSAGE.size :], log_ns, intake)
 
     def _note(self, text: str) -> bool:
-        """Take note of channels that come and go; whether any did."""
+        """Note channels that come and go. Returns whether any did."""
         try:
             said = json.loads(text)
             operation = said["op"]
@@ -127,7 +127,7 @@ class FoxgloveReceiver:
         return operation in ("advertise", "unadvertise")
 
     def _subscribe(self, connection: Connection, intake: Intake) -> None:
-        """Subscribe to what is wanted and not subscribed yet. A subscription has its channel's number."""
+        """Subscribe to wanted channels that are not subscribed yet. A subscription has its channel's number."""
         missing = []
         for sensor in self._wanted:
             if any(sensor == other for other, _ in self._subscribed.values()):
@@ -157,7 +157,7 @@ class FoxgloveReceiver:
         arrival = self._arrival(log_ns)
         try:
             message = self._deserialiser.read(data, channel.type, channel.encoding)
-        except Exception:  # rosbags lets those of struct, numpy and asserts through
+        except Exception:  # rosbags lets errors of struct, numpy and assert pass
             intake.counters.unreadable += 1
             return
         if sensor == "imu":
@@ -171,9 +171,10 @@ class FoxgloveReceiver:
             intake.put_scan(scan, arrival_ns)
 
     def _arrival(self, log_ns: int) -> int:
-        """When a message arrived, by the host's clock, or would have if the network were as fast as it once was.
+        """The arrival of a message by the host's clock, corrected for the network's varying delay.
 
-        Large clouds take longer than IMU samples; the log time is that at which the server had them.
+        Large clouds take longer than IMU samples. The log time is the moment at which the server had them, so the
+        smallest delay so far is assumed for every message.
         """
         now = time.time_ns()
         if not log_ns:
@@ -183,7 +184,7 @@ class FoxgloveReceiver:
         return arrival if now - arrival < _MOST_DELAY_NS else now
 
     def _report(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
-        """Put news into the intake, once however often it happens."""
+        """Put news into the intake, but only once, however often it happens."""
         if text != self._last_status:
             self._last_status = text
             intake.put_status(kind, "source", text)

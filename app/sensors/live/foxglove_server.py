@@ -17,7 +17,7 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
     """Serves on threads of its own; `publish` waits for slow clients.
 
     Attributes:
-        port: where it listens; 0 asks for any.
+        port: the port on which it listens; 0 asks for any free port.
 
     Raises:
         HemislamError: the port is taken.
@@ -45,7 +45,7 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
                     connection.send(MESSAGE.pack(1, number, log_ns) + data)
 
     def wait_for_subscribers(self, timeout_s: float) -> bool:
-        """Whether some client has asked for every topic, at the latest after this time."""
+        """Wait at most this long for a client that has asked for every topic. Returns whether there is one."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             if any(len(subscriptions) == len(self._channels) for subscriptions in list(self._clients.values())):
@@ -63,7 +63,7 @@ class FoxgloveServer(AbstractContextManager["FoxgloveServer"]):
         self.close()
 
     def _meet(self, connection: ServerConnection) -> None:
-        """One client, on its own thread, until it leaves."""
+        """Serve one client, on its own thread, until it leaves."""
         info = {"op": "serverInfo", "name": "hemislam feed", "capabilities": [], "supportedEncodings": ["cdr"]}
         channels = [
             {

@@ -18,19 +18,19 @@ from app.sensors.robosense import Model
 from app.slam.types import I64, U8
 
 HOLD = 3
-"""Packets of the next revolution to wait for, 2 ms: networks seldom reorder more widely."""
+"""Number of packets of the next revolution to wait for, 2 ms: networks seldom reorder over longer times."""
 JUMP_NS = 500_000_000
-"""A packet this far from the one before means another time, not disorder; the next packet must confirm it."""
+"""A packet this far in time from the previous one means that the time was set; the next packet must confirm it."""
 MAX_PACKETS = 1024
-"""In a revolution; twice what two returns at 10 Hz need. A longer one is cut here."""
+"""Most packets of a revolution; twice the number for two returns at 10 Hz. A longer revolution is cut here."""
 
 _LATE = 64
-"""A packet numbered this far back begins another count."""
+"""If a packet's number is this far back, the count has begun anew."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """What a packet of measurements states about itself: who sent it, when (None: without a date), and its number."""
+    """The head of a measurement packet: its sender, its time (None: without a date), and its number."""
 
     sensor: Model | Livox
     stamp_ns: int | None
@@ -47,11 +47,11 @@ def _read(packet: bytes) -> _Head | None:
 
 
 Pending = tuple[int, int, bytes, _Head]
-"""Time of the first block, arrival, packet, and what it states."""
+"""Time of the first block, arrival, packet, and its head."""
 
 
 def sensor_of(packet: bytes) -> Model | Livox | None:
-    """Who sent this packet of measurements; None if it holds none."""
+    """The sensor that sent this measurement packet; None if it holds no measurements."""
     head = _read(packet)
     return None if head is None else head.sensor
 
@@ -128,7 +128,7 @@ class Assembler:
         return frames
 
     def flush(self) -> Iterator[Revolution]:
-        """The revolutions so far, complete or not: the input is over, or silent."""
+        """The revolutions so far, complete or not, as the input has ended or is silent."""
         while self._checked < len(self._pending):
             yield from self._check()
         if self._pending:
@@ -162,7 +162,7 @@ class Assembler:
         self._count_lost(head.index)
 
     def _count_lost(self, index: int) -> None:
-        """Count by the packets' numbers; one that arrives late after all no longer counts."""
+        """Count lost packets by their numbers; a packet that arrives late is no longer counted as lost."""
         ahead = 0 if self._index is None else (index - self._index + (1 << 15)) % (1 << 16) - (1 << 15)
         if -_LATE < ahead < 0:
             self.counters.lost = max(self.counters.lost - 1, 0)
@@ -191,7 +191,7 @@ class Assembler:
         return []
 
     def _azimuths_at(self, at: int) -> tuple[int, ...]:
-        """Of each block, 0.01 deg; of a sensor that does not turn, its place within the time of a scan as if it did."""
+        """Azimuth of each block, 0.01 deg. If the sensor does not turn: by time, as if one scan were a turn."""
         stamp_ns, _, packet, head = self._pending[at]
         if isinstance(head.sensor, Livox):
             return (stamp_ns % SCAN_NS * TURN // SCAN_NS,)

@@ -40,7 +40,7 @@ _COUNTS = 32_768
 @dataclass(frozen=True, slots=True)
 class ImuSample:
     """Attributes:
-    number: of the datagram; None if it has none to go by. stamp_ns: as sent. gyro: rad/s. accel: m/s^2, IMU frame.
+    number: of the datagram; None if it has no usable number. stamp_ns: as sent. gyro: rad/s. accel: m/s^2, IMU frame.
     """
 
     number: int | None
@@ -63,7 +63,7 @@ def write_airy_imu(sample: ImuSample) -> bytes:
 
 
 def is_imu(datagram: bytes) -> bool:
-    """Whether it is to be read as IMU samples."""
+    """Whether a datagram holds IMU samples."""
     if datagram.startswith((IMU_MAGIC, _AIRY_MAGIC)):
         return True
     header = livox_udp.read_header(datagram)
@@ -105,28 +105,28 @@ def _airy_units(accel_range: int, gyro_range: int) -> tuple[float, float]:
 
 
 _HOLD = 4
-"""Samples to wait for one that is missing: 20 ms at 200 Hz."""
+"""Number of samples for which to wait for a missing one: 20 ms at 200 Hz."""
 _FAR = 1_000
-"""Numbers this far apart are another run of the sender."""
+"""If numbers are this far apart, the sender was restarted."""
 
 
 @dataclass(slots=True)
 class ImuOrder:
-    """Puts samples back in order by their numbers; counts what is lost, late or repeated."""
+    """Puts samples back in order by their numbers; counts lost, late and repeated ones."""
 
     counters: Counters = field(default_factory=Counters)
     _next: int | None = None
     _ahead: dict[int, ImuSample] = field(default_factory=dict)
 
     def add(self, datagram: bytes) -> list[ImuSample]:
-        """The samples that can go on, in order."""
+        """The samples that can be passed on, in order."""
         samples = read_imu(datagram)
         if not samples:
             self.counters.imu_foreign += 1
         return [ready for sample in samples for ready in self._one(sample)]
 
     def flush(self) -> list[ImuSample]:
-        """The samples that wait for a missing one, which is given up."""
+        """The samples that wait for a missing one, which is no longer awaited."""
         ready = []
         while self._ahead:
             self._skip_missing()
@@ -151,7 +151,7 @@ class ImuOrder:
         return ready + self._take()
 
     def _skip_missing(self) -> None:
-        """Go on with the first sample that is there."""
+        """Continue with the first available sample."""
         assert self._next is not None
         missing, first = min(((number - self._next) % (1 << 32), number) for number in self._ahead)
         self.counters.imu_lost += missing

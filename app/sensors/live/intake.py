@@ -1,7 +1,7 @@
 """A bounded buffer between the receiving threads and the engine's side. It never blocks the receiving threads.
 
-When the engine falls behind, the oldest waiting scans are dropped, each reported as a `DroppedScan`. IMU samples are
-not, unless nobody reads them for minutes.
+When the engine falls behind, the oldest waiting scans are dropped, and each is reported as a `DroppedScan`. IMU samples
+are kept unless nobody reads them for minutes.
 """
 
 import math
@@ -37,19 +37,19 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan, Vector
 
 MAX_BACKLOG = 100
-"""Scans that may wait for the engine: ten seconds of them at 10 Hz, enough to start another engine."""
+"""Most scans that wait for the engine: ten seconds at 10 Hz, enough to start another engine."""
 MAX_WAITING = 600_000
-"""IMU samples and news that may wait: twenty minutes at 500 Hz. The oldest are removed, as nobody reads them."""
+"""Most IMU samples and news that wait: twenty minutes at 500 Hz. Beyond that, the oldest are dropped."""
 MAX_HELD = 50_000
-"""Entries that may wait for the start: 10 s of an IMU at 5 kHz. A clock that is set back could make it more."""
+"""Most entries that wait for the start: 10 s of an IMU at 5 kHz. Without a limit, a clock set back could add more."""
 _SETTLE_NS = 1_000_000_000
 _SETTLE_SCANS = 3
 _SWAY_NS = 2_000_000_000
-"""The samples must be as long as this to tell a gyroscope's unit."""
+"""s: samples must span this time to determine a gyroscope's unit."""
 _TOO_FAST_SAMPLES = 20
-"""So many in turn that are too fast are no knock."""
+"""If this many samples in a row are too fast, it was not a knock."""
 _AHEAD_NS, _LATE_NS = -50_000_000, 2_000_000_000
-"""Stamps whose age on arrival is between these are taken as the time of day."""
+"""If the age of stamps on arrival is between these, they are taken as the time of day."""
 BUSY = "too many scans waited (mapping was paused, or slower than the scanner)"
 NO_IMU = "no IMU sample came to cover it"
 
@@ -58,7 +58,7 @@ Clock = Literal["auto", "sensor", "host"]
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What was learnt in the first second, and the state of the clocks, for another intake to continue with.
+    """What was settled in the first second, and the state of the clocks, for another intake to continue with.
 
     Attributes:
         clock: which clock stamps the data. maps: by sensor. units: of the IMU.
@@ -73,14 +73,14 @@ class Intake:
     """Receiving threads call `put_...`; one reader calls `take`.
 
     For the first second, or two if the gyroscope may be in deg/s, it holds everything back, until it knows the units
-    and whether the clocks of the two sensors agree. The log time of what it holds is that of its arrival.
+    and whether the clocks of the two sensors agree. The log time of an entry is the time of its arrival.
 
     Attributes:
         counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
 
     Args:
-        recorder: gets everything that comes, stamped in the engine's time, and what the engine never gets, because no
-            sample or no scan came with it, in the sensor's own.
+        recorder: gets everything that comes, stamped in the engine's time. Data that the engine never gets, because no
+            sample or no scan came with it, is stamped in the sensor's own time.
         counters, settled: of an intake that this one continues.
     """
 
@@ -135,13 +135,13 @@ class Intake:
             self._changed.notify()
 
     def put_findings(self, kind: Kind, sensor: Literal["LiDAR", "IMU"], findings: list[Finding]) -> None:
-        """What was found of a sensor, where that is not as expected."""
+        """Report findings about a sensor that are not as expected."""
         for finding in findings:
             if finding.verdict != "fine":
                 self.put_status(kind, sensor, f"{finding.subject}: {finding.spoken}")
 
     def end(self) -> None:
-        """Record what is still held back; nothing is put any more."""
+        """Record what is still held back; from now on, nothing is accepted."""
         with self._changed:
             while self._held:
                 self._record_unused(self._held.popleft())
@@ -149,7 +149,7 @@ class Intake:
     # --- the reader ------------------------------------------------------------------------------
 
     def take(self, timeout_s: float, *, scan: bool) -> tuple[list[ImuEntry | DroppedScan | Status], Scan | None]:
-        """All entries but scans, in the order of arrival, and the oldest scan if wanted; waits this long for any."""
+        """All entries except scans, in the order of arrival, and the oldest scan if wanted. Waits this long for any."""
 
         def some() -> bool:
             return bool(self._rest) or (scan and bool(self._scans))
@@ -161,7 +161,7 @@ class Intake:
             return rest, self._scans.popleft() if scan and self._scans else None
 
     def settled(self) -> Settled | None:
-        """What another intake can continue with; None while it is not known."""
+        """The state with which another intake can continue; None while it is unknown."""
         with self._changed:
             if self._held is not None:
                 return None
@@ -255,7 +255,7 @@ class Intake:
         return True
 
     def _record_unused(self, entry: ScanEntry | ImuEntry) -> None:
-        """Record what the reader does not get, in the sensor's own time, as the clock is not settled."""
+        """Record an entry that the reader does not get, in the sensor's own time, as the clock is not settled."""
         if self._recorder is None:
             return
         if isinstance(entry, ImuEntry):
@@ -297,7 +297,7 @@ class Intake:
         return all(_AHEAD_NS < np.median(ages) < _LATE_NS for ages in (scans, samples))
 
     def _release(self, entry: ScanEntry | ImuEntry) -> None:
-        """Stamp it in the engine's time and pass it to the recorder and the reader."""
+        """Stamp an entry in the engine's time and pass it to the recorder and the reader."""
         if isinstance(entry, ScanEntry):
             self._release_scan(entry)
         elif not self._maps["IMU"].jumps(entry.stamp_ns, entry.log_ns):

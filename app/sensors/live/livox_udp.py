@@ -19,13 +19,13 @@ from app.slam.types import I64, U8, Scan, Vector
 
 POINTS_PORT, IMU_PORT = 56301, 56401
 SCAN_NS = 100_000_000
-"""A scan is what came in such a part of a second, counted from whole seconds."""
+"""Duration of a scan; scans are counted from whole seconds."""
 SLOT_NS, SLOTS = 5_000, 96
 """Time between two firings, 200,000 a second, and firings in a packet."""
 _MOST_LOST = 0.1
-"""Share of points that may fall into the firing of another: stamps are rounded."""
+"""Share of points that may coincide with another point's firing: stamps are rounded."""
 FARTHEST_M = 100.0
-"""A point farther out on any axis is no return."""
+"""m: a point farther out on any axis is not a return."""
 _HEADER = struct.Struct("<B4H3B12xIQ")
 """Version, length, duration (0.1 us), points, number, frame, kind of content, of clock, CRC-32, time (ns)."""
 HEADER_BYTES: Final = _HEADER.size
@@ -42,7 +42,7 @@ _FAR_NS = 1 << 62
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Livox:
-    """A sensor whose scans are parts of time. blocks: of a packet, between which a scan may end."""
+    """A sensor whose scans are intervals of time. blocks: of a packet, between which a scan may end."""
 
     name: str
     blocks: int = 1
@@ -61,7 +61,7 @@ class LivoxHeader:
 
 
 def read_header(packet: bytes) -> LivoxHeader | None:
-    """None if it is no datagram of such a sensor: it has no mark, but its lengths must agree."""
+    """The header of a datagram; None if it is from another sensor. It has no mark, but its lengths must agree."""
     if len(packet) < HEADER_BYTES:
         return None
     version, length, _, count, number, _, kind, _, _, stamp = _HEADER.unpack_from(packet)
@@ -72,7 +72,7 @@ def read_header(packet: bytes) -> LivoxHeader | None:
 
 
 def read_imu(packet: bytes) -> tuple[int, Vector, Vector] | None:
-    """Time ns, rad/s and m/s^2 of a sample; None if it is none."""
+    """Time ns, rad/s and m/s^2 of an IMU sample; None if the packet is not one."""
     header = read_header(packet)
     if header is None or not header.of_imu:
         return None
@@ -117,7 +117,7 @@ class LivoxWriter:
         """Packets that this scan completes, each with the time at which the sensor would send it.
 
         Raises:
-            HemislamError: it is denser than such a sensor measures, so that points would be lost.
+            HemislamError: the scan is denser than such a sensor measures, so that points would be lost.
         """
         self._base_ns = scan.stamp_ns if self._base_ns is None else self._base_ns
         rows = np.zeros(len(scan), self._rows.dtype)

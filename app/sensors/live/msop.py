@@ -29,9 +29,9 @@ _TYPE_BPV4 = b"\x03\x04"
 _TYPE_AIRY = 0x31
 _TYPE_BPEARL = 3
 _LIKE_BPEARL = {1: "an RS-LiDAR-16", 2: "an RS-LiDAR-32"}
-"""Sensors whose packets have the RS-Bpearl's mark and blocks, by type."""
+"""Other sensors whose packets have the RS-Bpearl's mark and blocks, by type."""
 _LIKE_AIRY = {1: 48, 3: 192}
-"""Channels of the Airys that do not have 96, by model."""
+"""Number of channels of Airys that do not have 96, by model."""
 
 
 def is_cut(packet: bytes) -> bool:
@@ -40,9 +40,10 @@ def is_cut(packet: bytes) -> bool:
 
 
 def other_sensor(packet: bytes) -> str:
-    """Which RoboSense that cannot be read sent this measurement packet; "" if it can be read, or is none.
+    """The RoboSense that sent this measurement packet, if its packets cannot be read; "" if they can, or for another
+    packet.
 
-    The type is in byte 31, of the first generation in byte 30. One that is not known, or zero, excludes nothing if the
+    The type is in byte 31, for the first generation in byte 30. If it is unknown or zero, the packet is accepted if the
     blocks are where they should be.
     """
     if len(packet) != PACKET_BYTES:
@@ -60,7 +61,7 @@ def other_sensor(packet: bytes) -> str:
 
 
 def model_of(packet: bytes) -> Model | None:
-    """The sensor that sent it; None if it is no whole measurement packet, or of a sensor that cannot be read."""
+    """The sensor that sent a packet; None if it is not a complete measurement packet of a sensor that can be read."""
     if len(packet) != PACKET_BYTES or not packet.startswith((BPEARL.mark, AIRY.mark)) or other_sensor(packet):
         return None
     if packet.startswith(AIRY.mark):

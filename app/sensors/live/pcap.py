@@ -1,6 +1,6 @@
-"""UDP datagrams from .pcap and .pcapng files: VLAN tags, fragmented IP, IPv6; nothing else of a capture matters.
+"""UDP datagrams from .pcap and .pcapng files, with VLAN tags, fragmented IP and IPv6. Other packets are ignored.
 
-The known libraries for this do not give positions in the file, which reading from a later moment needs.
+The known libraries do not give positions in the file, which are needed to read from a later moment on.
 """
 
 import struct
@@ -14,9 +14,9 @@ NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
 MAX_RECORD = 1 << 22
 _FAR_NS = 1 << 62
 _MOST_INTERFACES = 1024
-"""Of a section; packets of further ones are passed over."""
+"""Most interfaces of a section; packets of further interfaces are ignored."""
 _FRAGMENTS_KEPT = 64
-"""Datagrams that may wait for missing fragments; beyond that, the oldest is given up."""
+"""Most datagrams that wait for missing fragments; beyond that, the oldest is dropped."""
 
 _TAGS = (0x8100, 0x88A8, 0x9100)
 _IP = (b"\x08\x00", b"\x86\xdd")
@@ -24,7 +24,7 @@ _UDP, _FRAGMENT = 17, 44
 
 
 class CaptureError(ValueError):
-    """The file is no capture, or is damaged; the text says how."""
+    """The file is not a capture, or is damaged; the text says how."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class Capture:
             self._frames, self._start = self._classic_frames, CapturePlace(24, order, (_Interface(link, units),))
 
     def datagrams(self, place: CapturePlace | None = None) -> Iterator[Datagram]:
-        """UDP datagrams from a frame's place on, or all; up to the end, or where the file makes no sense."""
+        """UDP datagrams from a frame's place on, or all; up to the end, or to where the file is damaged."""
         waiting: dict[bytes, _Fragments] = {}
         place = place or self._start
         with self._path.open("rb") as file:
@@ -99,7 +99,7 @@ class Capture:
                 self.complete = False
 
     def _classic_frames(self, file: BufferedReader, place: CapturePlace) -> Iterator[Captured]:
-        """Raises EOFError where the file makes no sense, or ends within a frame. So does `_next_frames`."""
+        """Raises EOFError where the file is damaged or ends within a frame. So does `_next_frames`."""
         (interface,) = place.interfaces
         while file.peek(1):
             position = file.tell()
@@ -131,7 +131,7 @@ class Capture:
 
 
 def _taken(file: BufferedReader, size: int) -> bytes:
-    """The next bytes. Raises EOFError: there are fewer, or no record is as large."""
+    """The next bytes. Raises EOFError: there are fewer, or `size` is too large for any record."""
     if size > MAX_RECORD or len(data := file.read(size)) < size:
         raise EOFError
     return data

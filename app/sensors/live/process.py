@@ -1,11 +1,11 @@
 """A live source in a process of its own.
 
-A busy engine then loses no packet, and an engine that dies loses neither the recording nor its place: the server owns
-the `LiveProcess`, the engine polls it through a `LiveClient`, and the next engine sets `LiveClient.place` to that of
+So a busy engine loses no packet, and an engine that dies loses neither the recording nor its place. The server owns the
+`LiveProcess`, the engine polls it through a `LiveClient`, and the next engine sets `LiveClient.place` to the place of
 its checkpoint.
 
-If the receiving process itself dies, another one takes over at the same address. It is given what the one before knew
-of clocks, units and counts. To the engine it looks as if the sensors had been silent.
+If the receiving process itself dies, another one takes over at the same address. It gets the clocks, units and counts
+of its predecessor. To the engine, it looks as if the sensors had been silent.
 """
 
 import logging
@@ -30,11 +30,11 @@ from app.slam.text_files import free_path
 log = logging.getLogger(__name__)
 
 MOST_RESTARTS, WITHIN_S = 4, 60.0
-"""If it dies once more within this time (s), it is not started again."""
+"""If the process dies once more within this time (s), it is not started again."""
 _START_S, _STOP_S = 30.0, 10.0
-"""How long it may take to open the source, and to finish the recording."""
+"""s that the process may take to open the source, and to finish the recording."""
 _RETRY_S = 0.5
-"""Between two attempts to start it again."""
+"""s between two attempts to start it again."""
 
 
 class LiveProcess(AbstractContextManager["LiveProcess"]):
@@ -90,7 +90,7 @@ class LiveProcess(AbstractContextManager["LiveProcess"]):
         raise HemislamError(problem or f"{TITLE} does not start; run it again.")
 
     def _watch(self) -> None:
-        """Keep what the process knows, and start it again when it dies, until `close`, or until it dies too often."""
+        """Store what the process knows, and restart it when it dies, until `close` or until it dies too often."""
         while not self._closing:
             try:
                 self._known = self._child.receive(1.0) or self._known
@@ -129,13 +129,13 @@ def _receive(owner: Link, *arguments: Any) -> None:
 
 
 class LiveClient:
-    """Polls a `LiveProcess` as one would a `LiveSource`. One engine at a time; `state` from anywhere.
+    """Polls a `LiveProcess` like a `LiveSource`. One engine at a time may poll; `state` may be read from anywhere.
 
-    While the process is started again, there are no scans.
+    While the process is being restarted, there are no scans.
 
     Attributes:
         place: number of the scan that was given last, as the receiving process counts them; 0 before the first.
-            Set it to that of an engine that died, and `poll` goes on behind it.
+            If it is set to the place of an engine that died, `poll` continues after that scan.
 
     Raises:
         HemislamError: the process has ended for good.
@@ -167,7 +167,7 @@ class LiveClient:
         return state
 
     def kept(self) -> None:
-        """State that nobody will ask for the scans up to this place again."""
+        """Tell the process that scans up to this place will not be requested again."""
         self._ask("kept", self.place)
 
     def close(self) -> None:
@@ -175,7 +175,7 @@ class LiveClient:
             self._connection.close()
 
     def _ask(self, *request: Any) -> Any:
-        """The answer; None while there is no process because it is being started again."""
+        """The answer; None while the process is being restarted."""
         try:
             if self._connection is None:
                 self._connection = Client(self._address.path, authkey=self._address.key)

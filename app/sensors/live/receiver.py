@@ -1,4 +1,4 @@
-"""What runs in the process that receives live data (`app.sensors.live.process`)."""
+"""The code that runs in the process that receives live data (`app.sensors.live.process`)."""
 
 import contextlib
 import logging
@@ -22,10 +22,10 @@ from app.slam.types import DroppedScan, Measurement
 log = logging.getLogger(__name__)
 
 HISTORY = 120
-"""Scans that can be given again, dropped ones included: an engine makes a checkpoint every ten frames."""
+"""Number of scans, including dropped ones, that can be given again: an engine makes a checkpoint every ten frames."""
 LOST: Final = "it was lost with the engine that had it"
 _REPORT_S = 0.2
-"""How often the owner is sent what is known."""
+"""How often the state is sent to the owner."""
 _NUMBERS = 1 << 40
 """Scan numbers reserved for each process, so that the next one does not use those of one that died."""
 
@@ -37,7 +37,7 @@ def receive(
     """Receive until the owner ends this process. The first message is "", or why the source cannot be opened.
 
     Args:
-        death: how the process before died, "" if there was none. known: what that one knew.
+        death: how the previous process died; "" if there was none. known: the state of that process.
     """
     with contextlib.suppress(OSError, AttributeError):
         os.nice(-5)  # packets do not wait; only root may do this
@@ -81,11 +81,11 @@ def accept(listener: Listener, server: "ScanServer") -> None:
 class ScanServer:
     """Answers the requests of `LiveClient`.
 
-    Scans and dropped scans are numbered from 1 as they are given, and a client says which one it had last. So a scan
-    that an engine took just before it died is given again to the next one.
+    Scans and dropped scans are numbered from 1 as they are given, and a client states the last number that it has. So a
+    scan that an engine took just before it died is given again to the next engine.
 
     Args:
-        first: number of the first one, less one.
+        first: number of the first scan, minus one.
     """
 
     def __init__(self, source: LiveSource, first: int = 0) -> None:
@@ -101,7 +101,7 @@ class ScanServer:
                 connection.send(self._answer(*connection.recv()))
 
     def known(self) -> Known:
-        """What the source knows."""
+        """The state of the source."""
         with self._lock:
             return self._source.known()
 

@@ -16,7 +16,7 @@ from app.slam.types import Scan, Vector
 
 FLUSH_S = 0.5
 MAX_SCANS, MAX_SAMPLES = 200, 100_000
-"""What may wait for the disk: 20 s of scans. If the disk is slower than that, the newest are left out."""
+"""Most messages that wait for the disk: 20 s of scans. If the disk is too slow, the newest are left out."""
 
 _Scan = tuple[Scan, int]
 _Imu = tuple[int, Vector, Vector, int]
@@ -25,7 +25,7 @@ _Imu = tuple[int, Vector, Vector, int]
 class Recorder:
     """Attributes:
     path: the .mcap. bytes_written: so far. left_out: messages that the disk was too slow for.
-    failure: why it stopped before its end, "" if it did not.
+    failure: why it stopped before its end; "" if it did not.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,13 +61,13 @@ class Recorder:
         self._add((stamp_ns, gyro, accel, arrival_ns))
 
     def close(self) -> None:
-        """Write what is waiting and the end of the file."""
+        """Write the waiting messages and the end of the file."""
         self._closing = True
         self._wake.set()
         self._thread.join(30.0)
 
     def _add(self, message: _Scan | _Imu) -> bool:
-        """Whether it will be written."""
+        """Queue a message. Returns whether it will be written."""
         if len(self._waiting) >= MAX_SAMPLES or self.failure:
             self.left_out += 1
             return False

@@ -1,4 +1,4 @@
-"""A live source: gives what a recording gives, as it happens."""
+"""A live source: gives the same events as a recording, as they happen."""
 
 import threading
 import time
@@ -16,17 +16,17 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
 SILENCE_S = 1.0
-"""A sensor that has sent nothing for this time is silent. Scans then wait for the IMU only until the next one comes."""
+"""s: a sensor that has sent nothing for this time is silent. If the IMU is, a scan waits only until the next scan."""
 
 Event = Measurement | DroppedScan | Status
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What a source knows, for another one that takes its place.
+    """The state of a source, for another source that takes its place.
 
     Attributes:
-        at_ns: the time of this, by the host's clock. state: counts, bytes recorded, scans that wait.
+        at_ns: the time of this state, by the host's clock. state: counts, bytes recorded, scans that wait.
         settled: units and clocks, None while they are not settled. pairing: the sequencer with its newest samples.
     """
 
@@ -42,7 +42,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
     One thread may poll. `close` ends the threads and the recording.
 
     Args:
-        before: what a source knew that this one takes the place of.
+        before: the state of the source that this one replaces.
     """
 
     def __init__(
@@ -83,12 +83,12 @@ class LiveSource(AbstractContextManager["LiveSource"]):
                 return None
 
     def state(self) -> LiveState:
-        """How the source is doing now."""
+        """The present state of the source."""
         recorded = None if self._recorder is None else self._recorded_before + self._recorder.bytes_written
         return replace(self._intake.state(), recorded=recorded)
 
     def known(self) -> Known:
-        """What another source needs to take the place of this one. Not while another thread polls."""
+        """The state that another source needs to replace this one. Do not call it while another thread polls."""
         return Known(time.time_ns(), self.state(), self._intake.settled(), self._sequencer.tail())
 
     def tell(self, kind: Kind, text: str) -> None:
@@ -109,7 +109,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
     def _gather(self, timeout_s: float) -> None:
         """Pass scans to the sequencer one at a time, so that later ones can still be dropped.
 
-        While the IMU is silent, the next scan sends the waiting one on its way.
+        While the IMU is silent, a waiting scan is passed on when the next one comes.
         """
         if self._heard_ns != self._sequencer.newest_imu_ns:
             self._heard_ns, self._heard_at = self._sequencer.newest_imu_ns, time.monotonic()

@@ -10,10 +10,10 @@ Kind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """Something happened to a source, which goes on.
+    """An event of a source, which continues.
 
     Attributes:
-        sensor: what it happened to, "LiDAR", "IMU" or "source". text: one sentence for the user.
+        sensor: the affected part, "LiDAR", "IMU" or "source". text: one sentence for the user.
         at_ns: when, by the host's clock.
     """
 
@@ -67,7 +67,7 @@ class Counters:
 
 @dataclass(frozen=True, slots=True)
 class LiveState:
-    """How a live source is doing, to be shown.
+    """The state of a live source, for display.
 
     Attributes:
         lidar_hz, imu_hz: over the last seconds. lidar_age_s, imu_age_s: since the last arrival, None before the first.
@@ -88,6 +88,6 @@ class LiveState:
     recorded: int | None = None
 
     def unheard(self, seconds: float) -> "LiveState":
-        """The same after a time in which the source did not answer."""
+        """The same state after a time in which the source did not answer."""
         lidar, imu = (None if age is None else age + seconds for age in (self.lidar_age_s, self.imu_age_s))
         return replace(self, lidar_hz=0.0, imu_hz=0.0, lidar_age_s=lidar, imu_age_s=imu)

@@ -25,13 +25,13 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
 BUFFER_BYTES = 16 << 20
-"""Requested from the kernel, so that nothing is lost while this process is busy; it may grant less."""
+"""Buffer size requested from the kernel, so that no packet is lost while this process is busy; it may grant less."""
 _DRAIN = 128
 _TIMESTAMP = 35
 """SO_TIMESTAMPNS: Linux notes when a datagram arrived, so that the time of reading matters little."""
 _TIMESPEC = struct.Struct("@ll")
 _REST_NS = 1_000_000_000
-"""Packets wait this long for the rest of their revolution; only the last ones before a silence do."""
+"""Packets wait this long for the rest of their revolution. This only concerns the last packets before a silence."""
 _DEVICE_WAIT_NS = 1_500_000_000
 """The device sends its angles once a second; at the start, scans wait for them."""
 
@@ -177,10 +177,10 @@ class PacketReceiver:
             intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)
 
     def _is_another(self, peer: Peer, beside: bool, intake: Intake) -> bool:
-        """Whether this is another sensor than the one in use: the first one, until it falls silent.
+        """Whether a packet is from another sensor than the one in use, which is the first until it falls silent.
 
         Args:
-            beside: it is a packet of settings or of the IMU, which a sensor sends from another port.
+            beside: whether the packet holds settings or IMU samples, which a sensor sends from another port.
         """
         current, now = self._sensor, time.monotonic()
         if current is None or now - self._heard_s > _REST_NS * 1e-9:
@@ -200,7 +200,7 @@ class PacketReceiver:
         if self._decoder is None or (before is not None and before.same(difop)):
             return
         if before is not None:
-            self._give(now, intake)  # what came before was measured with the old settings
+            self._give(now, intake)  # earlier packets were measured with the old settings
         self._decoder.configure(difop)
         self._assembler.turn_ns = round(60e9 / difop.rpm)
         intake.sensor = f"{self._model.name} {difop.serial}: {difop.describe()}"
@@ -231,7 +231,7 @@ class PacketReceiver:
                     intake.sensor = f"{frame.model.name}{without}"
 
     def _scans(self, frame: Revolution, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
-        """Those that can be given now, each with its arrival."""
+        """The scans that can be given now, each with its arrival."""
         if self._decoder is None:
             return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns, intake)
         scan = self._decoder.decode(frame)

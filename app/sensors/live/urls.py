@@ -1,4 +1,4 @@
-"""Addresses of live data, as `rsbpearl://0.0.0.0:6699,7788?clock=host`, and the source that they stand for."""
+"""Addresses of live data, such as `rsbpearl://0.0.0.0:6699,7788?clock=host`, and the source that they stand for."""
 
 import ipaddress
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ FOXGLOVE_PORT = 8765
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """What an address of one scheme may hold."""
+    """The parts that an address of one scheme may have."""
 
     ports: tuple[int, ...]
     options: tuple[str, ...]
@@ -44,7 +44,7 @@ _KINDS: dict[str, _Kind] = {
 @dataclass(frozen=True, slots=True)
 class Address:
     """Attributes:
-    ports: of a sensor several: for measurements, then for its other packets.
+    ports: a sensor may have several: for measurements, then for its other packets.
     options: `clock` (auto, sensor, host); of a RoboSense also `angles` (a CSV).
     """
 
@@ -55,7 +55,7 @@ class Address:
 
 
 def parse_address(text: str) -> Address:
-    """Raises HemislamError: the address has none of the known forms."""
+    """Raises HemislamError: the address is not of a known form."""
     scheme, separator, rest = text.partition("://")
     if not separator or scheme not in _KINDS:
         raise HemislamError(
@@ -88,7 +88,7 @@ def parse_address(text: str) -> Address:
 
 
 def _is_host(host: str) -> bool:
-    """Whether it may be a name or an address, or is empty; not whether it exists."""
+    """Whether a text may be a host's name or address, or is empty; not whether the host exists."""
     try:
         if ":" in host:
             ipaddress.IPv6Address(host)
@@ -108,7 +108,7 @@ def open_live(
         lidar: a sensor's address, such as `rsbpearl://HOST:MSOP,DIFOP`, or `foxglove://HOST:PORT`.
         imu: `imu-udp://HOST:PORT`, or another `foxglove://`; None: from the LiDAR's source.
         record: an .mcap into which everything is written.
-        before: what is known from a source that this one replaces.
+        before: the state of a source that this one replaces.
 
     Raises:
         HemislamError: an address has no known form, a port cannot be opened, or a file not be written.
@@ -135,7 +135,7 @@ def open_live(
         receivers.append(
             PacketReceiver(device, address.host or "0.0.0.0", address.ports, params, angles, own_imu=beside is None)
         )
-    # One connection to each Foxglove server, for all that is wanted of it.
+    # One connection to each Foxglove server, for all topics wanted from it.
     wanted: dict[tuple[str, int], frozenset[str]] = {}
     for source, sensors in ((address, {"lidar"} if beside else {"lidar", "imu"}), (beside, {"imu"})):
         if source is not None and source.scheme == "foxglove":

@@ -64,7 +64,7 @@ class Gnss:
 def received(
     gnss: Gnss, trajectory: SmoothTrajectory, duration_s: float, start_ns: int, rng: np.random.Generator
 ) -> Fixes:
-    """What it reports of a walk, with its covariance."""
+    """The fixes that the receiver reports during a walk, with their covariances."""
     times = np.arange(0.5 / gnss.rate, duration_s, 1.0 / gnss.rate)
     places, rotations = trajectory.poses(times)
     places = places + rotations @ np.array([gnss.x, gnss.y, gnss.z]) + gnss.noise * rng.normal(size=places.shape)

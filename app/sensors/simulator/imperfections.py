@@ -1,4 +1,4 @@
-"""What a real scanner, a real hand and real company add to a simulated walk. All of it is off by default.
+"""Imperfections of a real scanner, hand and surroundings for a simulated walk. All of them are off by default.
 
 Each term is one field of `Imperfections`: its size, 0 where it is off. `IMPERFECT` has the sizes of real devices.
 """
@@ -97,7 +97,7 @@ IMPERFECT = Imperfections(
 
 
 class Unit:
-    """One scanner with its own errors, the same in every scan; its firings go round `channels`."""
+    """One scanner with its own errors, the same in every scan; its firings cycle through `channels`."""
 
     def __init__(self, sizes: Imperfections, rng: np.random.Generator, channels: int = CHANNELS) -> None:
         self.sizes, self._channels = sizes, channels
@@ -152,7 +152,7 @@ class Unit:
         return mixed.ravel()
 
     def felt(self, imu: ImuSamples, start_ns: int, rng: np.random.Generator) -> ImuSamples:
-        """What the IMU reports of the samples that a good one would take."""
+        """The samples that this IMU reports in place of a perfect IMU's."""
         sizes, t = self.sizes, seconds(imu.stamps_ns - start_ns)
         frequencies, phases = self._hum
         hum = np.sin(2 * np.pi * t[:, None, None] * frequencies + phases)

@@ -47,7 +47,7 @@ class Pattern:
 
 
 def firing_pattern(model: Model = BPEARL, rate_hz: int = 10, every_block: int = 1) -> Pattern:
-    """An RS-Bpearl's, whose levers have their block's azimuth; only every k-th block fires."""
+    """The pattern of an RS-Bpearl, whose levers have their block's azimuth; only every k-th block fires."""
     elevation, still = np.deg2rad(model.elevations_deg), np.zeros(model.channels)
     pattern = turning(elevation, still, model.firing_offsets_ns, model.block_ns, rate_hz, every_block)
     azimuth = np.repeat(2 * np.pi * rate_hz * 1e-9 * pattern.blocks_ns, model.channels)

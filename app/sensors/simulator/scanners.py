@@ -47,7 +47,7 @@ class Scanner:
 
     @property
     def R_body_imu(self) -> F64:
-        """How the IMU lies in the walker's frame: x forward, y left, z up."""
+        """Rotation of the IMU in the walker's frame: x forward, y left, z up."""
         R_body_lidar = np.eye(3) if self.upright else R_BODY_IMU
         return np.asarray(R_body_lidar @ self.lidar.R_imu_lidar.T)
 

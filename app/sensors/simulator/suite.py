@@ -123,7 +123,7 @@ def make_twin(
 
 
 def unit_seed(twin: Twin, seed: int) -> int:
-    """A scanner of its own for each walk: errors of a suite walked with one scanner would be those of that scanner."""
+    """Each walk has a scanner of its own. With one scanner, the errors of a suite would be those of that scanner."""
     return zlib.crc32(f"{twin.name} {seed}".encode())
 
 
