@@ -1,6 +1,7 @@
-"""The engine's process, what pages are sent of it, and the one public port.
+"""The engine's process, the snapshots that pages get from it, and the only public port.
 
-`engine_process` runs a `controller` and a `player` there; `publisher` makes deltas, which `worker` and `fold` turn into
-snapshots here. `protocol` declares commands and snapshots, `keeping` the commands for what a session keeps beside the
-map. `web`, `access`, `bridge` and `api` are the port; `fork` runs two engines.
+In the engine's process, `engine_process` runs a `controller` and a `player`, and `publisher` makes deltas. In the
+server's process, `worker` and `fold` turn these into snapshots. `protocol` declares commands and snapshots, `keeping`
+the commands for what a session keeps beside the map. `web`, `access`, `bridge` and `api` form the port; `fork` runs two
+engines.
 """

@@ -1,6 +1,6 @@
 """Who may talk to the server. Checked for every request and every WebSocket, before anything else.
 
-- A page of another site must not reach us through the user's browser: its Origin is refused.
+- A page of another site must not reach this server through the user's browser: its Origin is refused.
 - On a loopback address there is no token, so the Host must be a loopback name (DNS rebinding).
 - On any other address a token is needed: once in the link, then in a cookie, or as a bearer token.
 - A second token is view only. Its requests must be GET, and its page may send nothing but the position of its
@@ -47,20 +47,20 @@ RESPONSE_HEADERS: Final = {
 }
 
 MOST_BYTES: Final = 1 << 20
-"""Of a request's body, and of a file uploaded in the page: YAML of some kilobytes."""
+"""Most bytes of a request's body, and of a file uploaded in the page, which is YAML of some kilobytes."""
 MOST_OF_MESSAGE: Final = 2 * MOST_BYTES
 MOST_OF_PICTURE: Final = 48 * MOST_BYTES
-"""Of what a page sends over its WebSocket: of any message, and of a picture that it was asked to render."""
+"""Most bytes of a WebSocket message from a page, and of a picture that the page was asked to render."""
 MOST_BYTES_AT_ONCE: Final = 16 * MOST_BYTES
-"""Of the bodies of all requests that are being read or answered."""
+"""Most bytes of the bodies of all requests that are being read or answered."""
 BODY_S: Final = 30.0
-"""A request's whole body must arrive within this time; the largest one at 35 kB/s."""
+"""A request's whole body must arrive within this time; the largest body needs 35 kB/s."""
 
 VIEWER: Final = "hemislam.viewer"
-"""Set in the scope of requests that came with the view-only token."""
+"""Key in the scope of requests that came with the view-only token."""
 
 OPEN_PATHS: Final = ("/healthz",)
-"""Answered without a token: they say only whether the server works."""
+"""Paths that are answered without a token: they only say whether the server works."""
 
 log = logging.getLogger(__name__)
 
@@ -81,8 +81,8 @@ class Access:
     """The rules for one server.
 
     Attributes:
-        token: the owner's; None on a loopback address. viewer_token: the view-only one; None: there is none.
-        secure: the server speaks TLS.
+        token: the owner's; None on a loopback address. viewer_token: the view-only token; None if there is none.
+        secure: whether the server speaks TLS.
     """
 
     port: int
@@ -112,11 +112,11 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
         self._access = access
-        self._held = 0  # bytes of bodies
+        self._held = 0  # bytes of request bodies in memory
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and scope["method"] == "HEAD":
-            scope = {**scope, "method": "GET"}  # uvicorn, which knows better, leaves the body out
+            scope = {**scope, "method": "GET"}  # uvicorn still knows the true method and leaves the body out
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
         elif refusal := self._refusal(HTTPConnection(scope)):
@@ -145,7 +145,7 @@ class Guard:
             except TimeoutError:
                 raise HTTPException(408, "The request took too long.", {"Connection": "close"}) from None
             if not message.get("more_body", False):
-                until = None  # from here on one waits only for the client to leave
+                until = None  # from here on, the only thing to wait for is that the client leaves
             length = len(message.get("body", b""))
             received += length
             self._held += length

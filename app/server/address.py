@@ -1,4 +1,4 @@
-"""Where the server listens, and the links that lead there."""
+"""The address on which the server listens, and the links to it."""
 
 import errno
 import os
@@ -24,7 +24,7 @@ def listen(host: str, port: int) -> socket.socket:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except OSError:
         raise HemislamError(f"{host} is not an address of this machine; choose another one by --host.") from None
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # named: else asyncio keeps Nagle on
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # protocol named, else asyncio keeps Nagle
     if os.name == "posix":  # on Windows it would let two servers share the port
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
@@ -47,7 +47,7 @@ def links(host: str, access: Access, token: str | None = None) -> list[str]:
     """The addresses to open: first for this computer, then for others.
 
     Args:
-        token: to put into them; None: the owner's, if there is one.
+        token: to put into the links; None: the owner's, if there is one.
     """
     names = ["localhost", _own_address()] if host in ("0.0.0.0", "::", "") else [host]
     token = token or access.token
@@ -57,7 +57,7 @@ def links(host: str, access: Access, token: str | None = None) -> list[str]:
 
 
 def _own_address() -> str:
-    """This computer's address on the network that leads outside; its name if there is none."""
+    """This computer's address on the network of its default route; its name if there is none."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # sends nothing: it only chooses the route

@@ -37,16 +37,16 @@ from app.slam.types import MOVING, NON_GROUND
 
 EXPORT_TIMEOUT_S = 600.0
 MOST_EXPORTS = 4
-"""At the same time. Each holds one of the forty threads that answer requests."""
+"""Most exports at the same time. Each holds one of the forty threads that answer requests."""
 
 
 # --- actions -------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Action:
-    """What `{"action": NAME, ...}` in a request's body sends to the engine.
+    """The command that `{"action": NAME, ...}` in a request's body sends to the engine.
 
     Attributes:
-        command: makes the command of the fields. fields: as `pydantic.create_model` takes them.
+        command: makes the command from the fields. fields: as `pydantic.create_model` takes them.
     """
 
     command: Callable[..., Command]
@@ -92,7 +92,7 @@ LOOPS = {
 
 
 class _Body(BaseModel):
-    """The body of a request. A `_` that ends a field's name is not part of it: `register` is a name of pydantic's."""
+    """The body of a request. A trailing `_` is not part of a field's name: pydantic itself uses `register`."""
 
     model_config = ConfigDict(extra="forbid", alias_generator=lambda name: name.removesuffix("_"))
 
@@ -110,7 +110,7 @@ def _bodies(actions: Mapping[str, Action]) -> Any:
 def _add_actions(
     router: APIRouter, path: str, engine: RunningEngine, actions: Mapping[str, Action], summary: str
 ) -> None:
-    """A route that sends the engine the command of the action named in the body."""
+    """Add a route that sends the engine the command of the action named in the body."""
 
     def post(body: Any) -> None:
         fields = body.model_dump(by_alias=True)

@@ -1,4 +1,4 @@
-"""Passes messages between a browser's WebSocket on our port and viser's on its own."""
+"""Passes messages between a browser's WebSocket on the public port and viser's WebSocket on its own port."""
 
 import asyncio
 import contextlib
@@ -16,17 +16,17 @@ from app.server.access import MOST_BYTES, MOST_OF_MESSAGE
 from app.server.viser_adapter import KEY_HEADER, Viser, is_readable
 
 VIEWER_MESSAGES: Final = frozenset({"ViewerCameraMessage"})
-"""What a view-only page may send to viser: where its own camera is."""
+"""The messages that a view-only page may send to viser: where its own camera is."""
 NEVER: Final = frozenset({"ShareUrlRequest", "ShareUrlDisconnect"})
-"""What no page may send: it would open viser's public tunnel to this machine."""
+"""The messages that no page may send: they would open viser's public tunnel to this machine."""
 
 PICTURE: Final = "GetRenderResponseMessage"
 """A picture of the scene that the page was asked for: the only message that may be large."""
 MOST_UPLOADS: Final = 4
-"""At the same time, from one browser."""
+"""Most uploads at the same time from one browser."""
 
 BUFFER_BYTES: Final = 1 << 20
-"""Of each socket on the way to the browser. The system's default would let tens of megabytes of old frames queue."""
+"""Send buffer of each socket on the way to the browser. By default, tens of megabytes of old frames could queue."""
 
 
 NO_MESSAGE: Final = "This is not a message of the page."
@@ -53,7 +53,7 @@ class Gate:
         """The message to pass on, encoded again so that viser reads exactly what was checked; None: leave it out.
 
         Raises:
-            Refused: it is not a message, is too large, or belongs to an upload that is.
+            Refused: it is not a message, is too large, or belongs to an upload that is too large.
         """
         try:
             message = msgspec.msgpack.decode(raw, type=dict[str, Any])

@@ -1,9 +1,9 @@
 """Keyframe clouds for display, thinned so that the whole map has no more points than a page can show.
 
-Every chunk has a level. Level 0 is the chunk as it was made. At each further level it has one point per voxel, of
-twice the edge of the level before; at the last level it has none. The map is thinned where that is missed least.
-Levels never fall: points that were thinned away are gone. The number of clouds is bounded too: where keyframes are
-close together, one takes over the points of the one before it.
+Every chunk has a level. Level 0 is the chunk as it was made. At each further level it has one point per voxel, and the
+edge of the voxels doubles; at the last level it has no points. The map is thinned where this is least noticed. Levels
+never fall: points that were thinned away are gone. The number of clouds is bounded too: where keyframes are close
+together, one takes over the points of the previous one.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ MOST_SHOWN: Final = 1000
 _BY_POINT: Final = ("points", "labels", "intensity", "ring")
 """Arrays of a chunk and of a keyframe's cloud with one row per point."""
 _SLACK: Final = 0.97
-"""A map over budget is thinned to this share of it, so that not every new keyframe thins it again."""
+"""A map over budget is thinned to this share of the budget, so that not every new keyframe thins it again."""
 
 
 def thinned(keyframe: Keyframe) -> Chunk:
@@ -70,7 +70,7 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
 
 
 def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
-    """The same with at most `MOST_SHOWN` that have points, spread evenly along the trajectory.
+    """The same chunks, of which at most `MOST_SHOWN` keep points, spread evenly along the trajectory.
 
     The keyframe whose neighbours are closest to each other gives its points to the later one, so that a seek back never
     shows points that were not measured yet.
@@ -104,7 +104,7 @@ def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
 
 
 def as_thin(chunk: Chunk, held: Chunk | None) -> Chunk:
-    """A chunk thinned as often as the one that it replaces, so that a changed label costs no other keyframe points."""
+    """A chunk thinned as often as the one it replaces, so that other keyframes lose no points by a changed label."""
     while held is not None and chunk.level < held.level:
         chunk = coarser(chunk) if chunk.level < COARSEST_LEVEL else _chosen(chunk, np.empty(0, np.int64), EMPTY_LEVEL)
     return chunk

@@ -1,4 +1,4 @@
-"""What happens in the engine's process: commands in, one piece of work at a time, changes out."""
+"""The work of the engine's process: commands come in, one piece of work is done at a time, changes go out."""
 
 import logging
 import math
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 _OF_THE_DEVICE = ("recording.", "sensor.")
 POLL_S = 0.02
-"""How often to look for results of other threads and processes."""
+"""s between two looks for results of other threads and processes."""
 _AT_ONCE = protocol.OpenRecording | protocol.Restart | protocol.SetSpeed | protocol.SetBreakpoints
 """Commands that do not wait for the session that is being opened."""
 _FOR_THE_FRAME = (
@@ -58,9 +58,9 @@ class Controller:
     """The open session and its transport. One thread calls `handle` and `work`.
 
     Args:
-        page: receives all changes. params: to begin with.
+        page: receives all changes. params: at the start.
         resolve: gives the parameters of a recording, before the user's changes; None: the present ones.
-        session_folder: for session files; None: none are kept. kept: of a live session that another process
+        session_folder: for session files; None: none are written. kept: of a live session that another process
             began. clock: monotonic seconds.
     """
 
@@ -79,15 +79,15 @@ class Controller:
         self._loops, self._player, self._writer = LoopCommands(page), Player(page, clock), SessionWriter()
         self._georeferencing = Georeferencing(page)
         self._saves: deque[tuple[protocol.Save, Future[Any]]] = deque()
-        self._share = 0.0  # of a save that is written
+        self._share = 0.0  # share of a save that is written
         self._shown_share: protocol.Progress | None = None
         self._open_session, self._resolve, self._session_folder = open_session, resolve, session_folder
         self._params = self._base = params  # with and without the user's changes
         self._kept = kept
-        self._resuming: SavedSession | None = None  # that is being repeated
+        self._resuming: SavedSession | None = None  # the session that is being repeated
         self._opening: tuple[protocol.Progress, Callable[[], None]] | None = None  # opens the next session
         self._waiting: list[Command] = []  # until that session is at its frame
-        self._of_before = 0  # how many of these, the first ones, waited when another one was asked for
+        self._of_before = 0  # number of these, from the first, that waited when another session was requested
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
         """Open a recording with exactly the present parameters, or a session file with its own."""
@@ -100,7 +100,7 @@ class Controller:
 
     # --- commands --------------------------------------------------------------------------------
     def handle(self, command: Command) -> None:
-        """Carry out a command. What cannot be done becomes a notice; nothing is raised."""
+        """Carry out a command. If it cannot be done, there is a notice; nothing is raised."""
         opening = self._opening is not None and not isinstance(command, _AT_ONCE)
         if opening or (self._resuming is not None and isinstance(command, _FOR_THE_FRAME)):
             self._waiting.append(command)
@@ -163,7 +163,7 @@ class Controller:
                 self._loops.handle(command, loops)
 
     def relabel(self) -> None:
-        """Label the frame anew if its parameters were changed: the page is then sent both at once, and draws once."""
+        """Relabel the frame if ground parameters were changed, so that the page gets both at once and draws once."""
         if self._opening is None:
             self._player.relabel()
 
@@ -184,7 +184,7 @@ class Controller:
         self._share = share
 
     def _show_share(self, share: float | None) -> None:
-        """How far a save is, in steps of a hundredth; None: it has ended. What is to be opened waits for it."""
+        """Show the progress of a save, in steps of a hundredth; None: it has ended. Opening waits for the save."""
         shown = self._opening[0] if self._opening is not None else None
         if share is not None:
             then = f", then {shown.title[0].lower()}{shown.title[1:]}" if shown is not None else ""
@@ -277,12 +277,12 @@ class Controller:
 
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
-        """Let `work` open it, so that the page first says that this takes a moment."""
+        """Let `work` open it later, so that the page first says that this takes a moment."""
         self._opening, self._of_before = (protocol.Progress.opening(path), opening), len(self._waiting)
         self._page.put(progress=self._opening[0], urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
-        """Open; if that is not possible, everything stays as it is."""
+        """Open the recording; if that is not possible, everything stays as it is."""
         self._opening = None
         try:
             opening()
@@ -312,7 +312,7 @@ class Controller:
         self._take(session)
 
     def _reopen(self) -> None:
-        """Begin again with the present parameters. What the user made stays; loop edits only for the same keyframes."""
+        """Begin again with the present parameters. The user's work stays; loop edits only for the same keyframes."""
         before, kept = self._need_session(), self._kept
         self._of_before = 0
         info, edits = before.feed.info, before.edits
@@ -352,7 +352,7 @@ class Controller:
         self._loops.clear()
         self._player.take(session)
         self._page.put(resumed=saved is not None)
-        if session.frame < 0:  # else it goes on where a process that died was
+        if session.frame < 0:  # else it continues where a process died
             state = saved.state if saved is not None else State(self._params)
             self._keep(Kept(**state.kept()))
         self._resuming = None
@@ -374,7 +374,7 @@ class Controller:
             self._page.notice("warning", self._writer.error)
 
     def _leave_waiting(self) -> None:
-        """Another session begins: what waited for the one before is not done."""
+        """Another session begins: drop the commands that waited for the previous one."""
         for command in self._waiting[: self._of_before]:
             if isinstance(command, protocol.Save):
                 why = "Another recording was opened before it was saved."
@@ -387,11 +387,11 @@ class Controller:
             self.handle(command)
 
     def close(self) -> None:
-        """Finish the saves under way and close the recording."""
+        """Finish the saves in progress and close the recording."""
         session = self._player.session
         if session is not None:
             session.finish_saves()
-            if self._resuming is None:  # else it is written where the session is going to
+            if self._resuming is None:  # else the target frame has been written already
                 self._write(session)
             session.close()
         self._writer.close()

@@ -16,7 +16,7 @@ from app.slam.params import Params
 from app.slam.warmup import compile_kernels
 
 FRAME_PERIOD_S = 0.04
-"""Frames are published no more often than this; answers to the user at once."""
+"""s: frames are published no more often than this; answers to the user at once."""
 
 
 class Updates:
@@ -27,10 +27,10 @@ class Updates:
         self._acknowledged, self._published = True, 0.0
 
     def exchange(self, wait: float | None) -> list[Command]:
-        """Send what changed, if the owner is ready and it is time. Returns the commands that have come.
+        """Send the changes, if the owner is ready and it is time. Returns the commands that have come.
 
         Args:
-            wait: for commands, if none has come (s); None: without limit. Shorter if there is something to send.
+            wait: s to wait for commands, if none has come; None: without limit. Shorter if there is something to send.
 
         Raises:
             LinkClosed: the owner is gone, or asks the engine to end.
@@ -78,7 +78,7 @@ def run_loop(
     opener: OpenSession,
     prepare: Callable[[Callable[[str, float], None]], None] | None = None,
 ) -> None:
-    """As `main`, with the function that opens a recording and one that prepares it, reporting (name, fraction)."""
+    """As `main`, with functions that open a recording and that prepare the engine, reporting (name, fraction)."""
     page = Publisher(setup.params, setup.seen)
     updates = Updates(owner, page)
     controller = Controller(
@@ -103,6 +103,6 @@ def run_loop(
             for command in commands:
                 controller.handle(command)
             controller.relabel()
-            commands = updates.exchange(0.0 if commands else controller.work())  # the page first hears what takes long
+            commands = updates.exchange(0.0 if commands else controller.work())  # first tell the page about long work
     except LinkClosed:
         controller.close()

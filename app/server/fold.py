@@ -1,6 +1,7 @@
-"""Makes snapshots of deltas, in the reader's process.
+"""Makes snapshots from deltas, in the reader's process.
 
-Computed here, not sent: positions of frames and keyframes in the map, the distance travelled, the error to the truth.
+Some values are computed here instead of being sent: positions of frames and keyframes in the map, the distance
+travelled, the error to the truth.
 """
 
 from collections.abc import Iterable
@@ -27,7 +28,7 @@ NOTICES_KEPT = 50
 class Fold:
     """Applies deltas to a snapshot. One thread writes; any thread may read `snapshot`, whose arrays never change.
 
-    It keeps the frames, keyframes and chunks after the frame shown, too. point_budget: most points of all chunks.
+    It also keeps frames, keyframes and chunks after the frame shown. point_budget: most points of all chunks.
     """
 
     def __init__(self, snapshot: Snapshot | None = None, point_budget: int = POINT_BUDGET) -> None:
@@ -54,7 +55,7 @@ class Fold:
         self._take_chunks(delta, now)
         shown = min(now.transport.frame + 1, len(self._frames))
         keyframes = int(np.searchsorted(self._keyframes, shown))
-        poses = before.keyframe_poses  # the same object tells the page that none has moved
+        poses = before.keyframe_poses  # the identical object tells the page that none has moved
         if moved or keyframes != len(poses):
             poses = self._poses[:keyframes]
         T_map_truth, series = self._series(shown, now.recording)
@@ -71,7 +72,7 @@ class Fold:
         return self.snapshot
 
     def edit(self, *, notices: Iterable[Notice] = (), **values: Any) -> Snapshot:
-        """Replace fields and add notices: the next revision."""
+        """The next revision: fields replaced and notices added."""
         before = self.snapshot
         kept = (*before.notices, *notices)[-NOTICES_KEPT:]
         self.snapshot = replace(before, revision=before.revision + 1, notices=kept, **values)

@@ -19,7 +19,7 @@ _RECENT = 20
 class FolderEntry:
     """A line of the file browser: a file to choose, with its size in bytes, or a folder to look into.
 
-    outside: it is neither, but a link to a file outside, which cannot be opened.
+    outside: the line is a link to a file outside the folders, which cannot be opened.
     """
 
     path: Path
@@ -29,7 +29,7 @@ class FolderEntry:
 
 
 class Folders:
-    """Folders given on the command line. Nothing outside them is listed or opened, also not through links.
+    """Folders given on the command line. Nothing outside them is listed or opened, not even through links.
 
     Raises:
         HemislamError: one of them is not a folder.
@@ -62,7 +62,7 @@ class Folders:
         return real
 
     def openable(self, path: Path | str) -> Path:
-        """As `inside`; what a session file reads must be inside too. Raises as `inside`."""
+        """As `inside`. Files that a session file reads must be inside too. Raises as `inside`."""
         real = self.inside(path)
         if real.suffix == SUFFIX:
             session = read_session(real)
@@ -74,7 +74,7 @@ class Folders:
     def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[FolderEntry]:
         """The contents of a folder inside: first its folders, then the files that may be chosen, each sorted by name.
 
-        What may not be read, and a link that leads nowhere, is left out.
+        Unreadable entries and dangling links are left out.
 
         Raises:
             HemislamError: as `inside`, or the folder cannot be read.
@@ -88,7 +88,7 @@ class Folders:
         return sorted(found, key=lambda entry: (entry.is_choice, entry.path.name.casefold()))
 
     def sessions(self, kept: Path) -> list[tuple[Path, SavedSession]]:
-        """The newest session files in a folder whose recordings are inside, newest first, without those never begun."""
+        """The newest session files in a folder, newest first: those that were begun and whose recording is inside."""
         found = []
         for path in session_files(kept)[:_RECENT]:
             try:

@@ -1,7 +1,7 @@
-"""Two settings side by side: the session A, and a fork of it, B, that goes where A goes.
+"""Two settings side by side: the session A, and a fork B of it, which follows A from frame to frame.
 
-The engine is deterministic, so a fork is a session file: where A is, with other parameters. B is a second
-engine's process that opens the file and then seeks to whatever frame A is at. A never waits for B.
+The engine is deterministic, so a fork is a session file: A's frame, with other parameters. B is a second engine's
+process that opens this file and then seeks to whatever frame A is at. A never waits for B.
 """
 
 import re
@@ -34,18 +34,18 @@ from app.slam.text_files import free_path, shortened
 
 MAIN = "main"
 PERIOD_S = 0.02
-"""How often to look where A is."""
+"""s between two checks of A's frame."""
 AGAIN_S = 1.0
-"""The command to B is repeated after this time: a process that dies loses its commands."""
+"""The command to B is repeated after this time, since a process that dies loses its commands."""
 APART = 1_000_000
-"""Between the session and notice numbers of one engine and the next, so that the page never takes one for another."""
+"""Offset between the session and notice numbers of two engines, so that the page never confuses them."""
 _MOST_KEPT = 30
 _NOT_KEPT = "This session has no session file, so it cannot be forked."
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One of the two. folder: of a fork, deleted when it is discarded."""
+    """A or B. folder: of a fork; deleted when the fork is discarded."""
 
     engine: RunningEngine
     name: str
@@ -53,7 +53,7 @@ class Side:
 
 
 def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
-    """The session that goes on from the frame of `a` with some parameters changed.
+    """The session that continues from the frame of `a` with some parameters changed.
 
     Raises:
         HemislamError: there is no frame yet, the session is not kept in a file, or a value is not possible.
@@ -76,7 +76,7 @@ def same_recording(a: Snapshot, b: Snapshot) -> bool:
 
 
 def follow(a: Snapshot, b: Snapshot) -> Seek | None:
-    """What brings B to A's frame, if it is elsewhere; at A's end to its own end, where the last loops are found."""
+    """The seek that brings B to A's frame; None if it is there. At A's end, B goes to its end, for the last loops."""
     wanted, here = a.transport.frame, b.transport.frame
     if wanted < 0 or not same_recording(a, b) or (b.transport.finished and here <= wanted):
         return None
@@ -86,7 +86,7 @@ def follow(a: Snapshot, b: Snapshot) -> Seek | None:
 
 
 def engine_number(snapshot: Snapshot) -> int:
-    """Which engine a snapshot is of: 0 is the first one, each fork has a number of its own."""
+    """The number of the engine that made a snapshot: 0 is the first engine, and each fork has its own number."""
     return snapshot.session // APART
 
 
@@ -96,7 +96,7 @@ class Workspace:
     All methods may be called by any thread.
 
     Args:
-        engine: A, at first the main session. setup: that it was started with; B is started alike.
+        engine: A, at first the main session. setup: with which A was started; B is started in the same way.
         start: starts an engine.
     """
 
@@ -112,7 +112,7 @@ class Workspace:
     # --- A, as the page and scripts use it -------------------------------------------------------
     @property
     def snapshot(self) -> Snapshot:
-        """The newest one of A."""
+        """A's newest snapshot."""
         return self._sides[0].engine.snapshot
 
     def send(self, command: Command) -> None:
@@ -128,13 +128,13 @@ class Workspace:
     # --- B ---------------------------------------------------------------------------------------
     @property
     def other(self) -> Snapshot | None:
-        """The newest one of B; None while there is no fork."""
+        """B's newest snapshot; None while there is no fork."""
         b = self._sides[1]
         return b.engine.snapshot if b is not None else None
 
     @property
     def names(self) -> tuple[str, str]:
-        """Of A and B."""
+        """The names of A and B."""
         a, b = self._sides
         return a.name, b.name if b is not None else ""
 
@@ -182,7 +182,7 @@ class Workspace:
         return [file for file in others if recording_of(file) == a.recording.path.resolve()]
 
     def swap(self) -> None:
-        """B becomes A: it goes on where A is, as A did, and A follows. Raises HemislamError without a fork."""
+        """Swap the two: B becomes A, at A's frame, and A becomes B and follows. Raises HemislamError without a fork."""
         with self._lock:
             a, b = self._need_fork()
             before, after = a.engine.snapshot, b.engine.snapshot
@@ -238,7 +238,7 @@ class Workspace:
                     side.engine.close()
 
     def _place(self, name: str) -> tuple[Side, Path]:
-        """A, and a folder for a new B, which is not there yet."""
+        """A, and a folder for a new B, which does not exist yet."""
         a, b = self._sides
         if b is not None:
             raise HemislamError("There is a fork already; keep or discard it first.")
@@ -253,7 +253,7 @@ class Workspace:
             replace(
                 self._setup,
                 recording=file.resolve(),
-                truth=None,  # the file says which
+                truth=None,  # the session file names it
                 params=session.state.params,
                 play=False,
                 breakpoints=Breakpoints(),

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class Georeferencing:
-    """Begins the work in a thread of the session and takes in what comes of it; one thread calls `update`."""
+    """Starts the work in a thread of the session and takes in its results; one thread calls `update`."""
 
     def __init__(self, page: Publisher) -> None:
         self._page, self._earth = page, Earth()  # the latter as it is shown
@@ -24,7 +24,7 @@ class Georeferencing:
         self._under_way: Future[Results] | None = None
 
     def choose(self, session: Session, survey: Survey | None) -> None:
-        """Georeference by this from now on. The page knows it at once, what comes of it once that is found."""
+        """Georeference by this from now on. The page shows the choice at once, and the result once it is found."""
         before = self._earth if self._begun_from[0] is session else Earth()
         session.survey = survey
         source = survey and (survey.gnss, survey.control)
@@ -32,10 +32,10 @@ class Georeferencing:
         self._put(Earth(survey, before.found if same else None))
 
     def update(self, session: Session, *, still: bool) -> bool:
-        """Show what has come, and begin anew where that is called for. Returns whether work is under way.
+        """Show new results, and start again if needed. Returns whether work is in progress.
 
         Args:
-            still: the session stays at its frame. While it goes on, only the user's choices are followed at once.
+            still: the session stays at its frame. While it moves on, only the user's choices are followed at once.
         """
         if self._under_way is not None:
             if not self._under_way.done():
@@ -58,7 +58,7 @@ class Georeferencing:
         return True
 
     def _take(self, session: Session, work: Future[Results]) -> None:
-        """Show what it found, unless something else was chosen meanwhile."""
+        """Show the result of the work, unless something else was chosen meanwhile."""
         survey, error = session.survey, work.exception()
         if self._begun_from[:2] != (session, survey):
             return

@@ -1,4 +1,4 @@
-"""Commands that change what a session keeps beside the map, and what each of them makes of it."""
+"""Commands that change what a session keeps beside the map, and their effects."""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -9,7 +9,7 @@ from app.server.protocol import Command
 from app.slam.errors import HemislamError
 
 MOST_NOTES: Final = 1000
-"""Every page and every REST answer holds all of them."""
+"""These are limited because every page and every REST answer holds all of them."""
 MOST_VIEWS: Final = 6
 MOST_MEASURES: Final = 200
 
@@ -27,7 +27,7 @@ class AddNote(KeptCommand, frozen=True):
 class EditNote(KeptCommand, frozen=True):
     """Replace the text of the note with this place in `Snapshot.notes`; an empty text deletes it.
 
-    before: its text until now. If another page has changed it meanwhile, it stays as it is.
+    before: its text until now. If another page has changed the note meanwhile, it stays as it is.
     """
 
     place: int
@@ -73,14 +73,14 @@ class Paint(KeptCommand, frozen=True):
 
 
 class UndoPaint(KeptCommand, frozen=True):
-    """Take the last `Paint` back."""
+    """Undo the last `Paint`."""
 
 
 def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
-    """The same after a command, given at a frame.
+    """The kept values after a command given at a frame.
 
     Raises:
-        HemislamError: there are too many notes or measures, another page has changed what is edited, or as `Clip`.
+        HemislamError: there are too many notes or measures, another page has changed the edited one, or as `Clip`.
     """
     notes, measures = kept.notes, kept.measures
     match command:

@@ -1,4 +1,4 @@
-"""Loop commands of the page, and what the page is shown of loops."""
+"""Loop commands of the page, and the view of loops that the page gets."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ class LoopCommands:
         self._state: LoopState | None = None
 
     def clear(self) -> None:
-        """Another session begins."""
+        """Forget everything, since another session begins."""
         self._view, self._state = LoopsView(), None
         self._page.put(loops=self._view)
 

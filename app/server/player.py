@@ -23,14 +23,14 @@ log = logging.getLogger(__name__)
 SOURCE_PERIOD_S = 0.5
 SLOWEST = 0.1
 LONGEST_LAG_S = 0.5
-"""Playing that is later than this does not catch up; it goes on from where it is."""
+"""s: if playing is later than this, it does not catch up but continues from the present moment."""
 LONG_SEEK = 20
-"""Frames to process on the way to a frame, from which on progress is shown."""
+"""Progress is shown if at least this many frames must be processed on the way to a frame."""
 ONLY_ON = "A live source cannot go back; record it, then open the recording."
 FIRST_DOUBT = 100
-"""Frames after which a run is first checked for doubts; then after twice as many, and so on, and at the end."""
+"""A run is first checked for doubts after this many frames, then after twice as many, and so on, and at the end."""
 _WARNINGS = ("disconnected", "silent", "jump", "recording", "units", "restarted")
-"""Kinds of `Status` that are a warning, not only news."""
+"""Kinds of `Status` that are warnings, not just information."""
 
 
 class Pacer:
@@ -70,7 +70,7 @@ class Pacer:
 
 @dataclass(frozen=True, slots=True)
 class SeekTarget:
-    """A frame to go to. origin: where the seek began. stepping: by steps, to which further ones are added."""
+    """A frame to go to. origin: where the seek began. stepping: whether further steps are added to it."""
 
     frame: int
     origin: int
@@ -85,8 +85,8 @@ class Player:
 
     Attributes:
         session: the open one, or None. breakpoints: where playing pauses.
-        page_behind: the page does not show the session's frame yet.
-        relabelling: the ground of the frame shown has to be segmented again, with the present parameters.
+        page_behind: whether the page does not show the session's frame yet.
+        relabelling: whether the ground of the frame shown must be segmented again, with the present parameters.
     """
 
     def __init__(self, page: Publisher, clock: Callable[[], float] = time.monotonic) -> None:
@@ -100,7 +100,7 @@ class Player:
         self._moment: CheckedFrame | None = None  # the frame that the page shows
         self._doubted: set[str] = set()  # reasons already reported, without their numbers
 
-    # --- what is asked for -----------------------------------------------------------------------
+    # --- requests --------------------------------------------------------------------------------
     def take(self, session: Session) -> None:
         """Begin with another session, at its frame, or at its first one."""
         self.session = session
@@ -141,7 +141,7 @@ class Player:
         self._page.show(speed=factor)
 
     def step(self, session: Session, frames: int) -> None:
-        """Go this many frames on, or back; steps not done yet add up. Raises HemislamError: back on a live source."""
+        """Go this many frames forward, or back; pending steps add up. Raises HemislamError: back on a live source."""
         if frames < 0 and not session.feed.repeatable:
             raise HemislamError(ONLY_ON)
         if self._target is not None and self._target.stepping:
@@ -154,8 +154,8 @@ class Player:
         self._aim(session, frame, frame if frame < max(session.heading, session.frame) else None, stepping=True)
 
     def seek(self, session: Session, frame: int) -> None:
-        """Go to a frame as fast as possible, then go on as before; from the last one to the end, where loops are sought
-        once more. Raises HemislamError: it is live.
+        """Go to a frame as fast as possible, then continue as before. From the last frame, go on to the end, where
+        loops are searched once more. Raises HemislamError: the source is live.
         """
         if not session.feed.repeatable:
             raise HemislamError(ONLY_ON)
@@ -163,11 +163,11 @@ class Player:
         self._aim(session, frame + (frame + 1 == frames), frame)
 
     def resume(self, session: Session, frame: int, *, to_end: bool) -> None:
-        """Go to the frame of a session file. to_end: and on to the end of the recording."""
+        """Go to the frame of a session file. to_end: then on to the end of the recording."""
         self._aim(session, max(frame, 0) + to_end, frame)
 
     def _aim(self, session: Session, frame: int, as_it_was: int | None, *, stepping: bool = False) -> None:
-        """Aim at a frame. as_it_was: the last frame to be repeated; later ones are processed anew. None: all are."""
+        """Aim at a frame. as_it_was: the last frame to repeat; later ones are processed anew. None: repeat all."""
         if as_it_was is not None:
             try:
                 session.go_to(as_it_was)
@@ -208,7 +208,7 @@ class Player:
                 self._page.show(finished=True)
                 return None
             self._page.put(live=state, recording=opened_recording(session))
-            if self._page.transport.playing:  # also once it sends nothing more
+            if self._page.transport.playing:  # also if it sends nothing any more
                 self._page.show(frames_per_second=self._pacer.rate(), urgent=False)
         return SOURCE_PERIOD_S
 
@@ -228,7 +228,7 @@ class Player:
         revisited = session.revisits
         try:
             entry = session.peek()
-        except Exception as error:  # what was processed stays
+        except Exception as error:  # frames processed so far stay
             self.fail("The recording cannot be read any further", error)
             self._page.show(finished=True)
             return None
@@ -271,7 +271,7 @@ class Player:
         return 0.0
 
     def _doubt(self, session: Session) -> None:
-        """Say why the run cannot be right, each reason once."""
+        """Report why the run cannot be right, each reason once."""
         for doubt in doubts(session.log, session.loops.tied_ns if session.loops else NO_PAUSES):
             reason = re.sub(r"[\d.]+", "#", doubt)
             if reason not in self._doubted:
@@ -279,7 +279,7 @@ class Player:
                 self._page.notice("warning", f"{IN_DOUBT} {doubt}")
 
     def _passed(self, session: Session, result: StepResult, *, played: bool) -> None:
-        """Pause where a breakpoint holds, unless the frame is only passed by a seek."""
+        """Pause if a breakpoint is met, unless a seek only passes the frame."""
         before, self._moment = self._moment, CheckedFrame(result)
         if "error" in self.breakpoints.chosen and before is not None and session.frame > 0:
             errors = session.errors()
@@ -319,7 +319,7 @@ class Player:
             self._page.put(progress=Progress(f"Going to frame {target.frame}", fraction))
 
     def relabel(self) -> None:
-        """Segment the ground of the frame shown again, if that is called for."""
+        """Segment the ground of the frame shown again, if needed."""
         session, result, due = self.session, self._page.result, self.relabelling
         self.relabelling = False
         if not due or session is None or result is None:

@@ -1,7 +1,6 @@
-"""What passes between the engine's process and its users: commands one way, snapshots the other.
+"""Messages between the engine's process and its users: commands one way, snapshots the other.
 
-Both are frozen values. Session files record commands. A snapshot is cumulative: a reader that misses ten of them loses
-nothing.
+Both are frozen values. A snapshot is cumulative: a reader that misses ten of them loses nothing.
 """
 
 import math
@@ -30,7 +29,7 @@ from app.slam.types import F32, F64, I64, U8, U16, StepResult
 LIVE = Path("live")
 """Stands for the live source wherever a recording is named."""
 ACKNOWLEDGED = "acknowledged"
-"""Sent to the engine in answer to each delta: the next one may come."""
+"""Sent to the engine in answer to each delta: it may send the next one."""
 
 
 # --- commands ------------------------------------------------------------------------------------
@@ -39,7 +38,7 @@ class Command(msgspec.Struct, frozen=True):
 
 
 class Play(Command, frozen=True):
-    """Go on at the chosen speed; at the end of a recording, from its first frame, as by `Seek`."""
+    """Play at the chosen speed; at the end of a recording, play again from its first frame, as by `Seek`."""
 
 
 class Pause(Command, frozen=True):
@@ -47,7 +46,7 @@ class Pause(Command, frozen=True):
 
 
 class StepFrame(Command, frozen=True):
-    """Pause and go this many frames on; back, if negative."""
+    """Pause and go this many frames forward, or back if negative."""
 
     frames: int = 1
 
@@ -59,7 +58,7 @@ class SetSpeed(Command, frozen=True):
 
 
 class Seek(Command, frozen=True):
-    """Go to a frame, back or on. One that was processed before is shown as it was, except for its ground labels.
+    """Go back or forward to a frame. A frame processed before is shown as it was, except for its ground labels.
 
     The frames after it are processed again, with the present parameters.
     """
@@ -68,7 +67,7 @@ class Seek(Command, frozen=True):
 
 
 class SetBreakpoints(Command, frozen=True):
-    """Pause at frames where one of these holds, from now on."""
+    """From now on, pause at frames that meet one of these."""
 
     breakpoints: Breakpoints
 
@@ -118,8 +117,8 @@ class Save(Command, frozen=True):
     """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` reports when.
 
     Attributes:
-        formats: as `hemislam export` has them; none: all files of a run. choice: of points, as there.
-        fetched: the sender takes the files from there at once and removes the folder; the page says nothing of it.
+        formats: as in `hemislam export`; none: all files of a run. choice: of points, as in `hemislam export`.
+        fetched: the sender takes the files at once and removes the folder; the page does not mention it.
     """
 
     folder: Path
@@ -136,7 +135,7 @@ class EditLabels(Command, frozen=True):
 
 
 class UndoLabels(Command, frozen=True):
-    """Take the last `EditLabels` back."""
+    """Undo the last `EditLabels`."""
 
 
 class LoopCommand(Command, frozen=True):
@@ -150,7 +149,7 @@ class EditLoop(LoopCommand, frozen=True):
 
 
 class UndoLoop(LoopCommand, frozen=True):
-    """Take the last `EditLoop` back."""
+    """Undo the last `EditLoop`."""
 
 
 class RedoLoop(LoopCommand, frozen=True):
@@ -158,7 +157,7 @@ class RedoLoop(LoopCommand, frozen=True):
 
 
 class TryLoop(LoopCommand, frozen=True):
-    """Show in `LoopsView.tried` what an edit would make of the graph, without applying it; None: show nothing."""
+    """Show in `LoopsView.tried` what the graph would become with an edit, without applying it; None: show nothing."""
 
     command: LoopEdit | None
 
@@ -230,7 +229,7 @@ class Transport:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Long work under way. fraction: 0-1, nan while unknown."""
+    """Long work in progress. fraction: 0-1, nan while unknown."""
 
     title: str
     fraction: float
@@ -247,7 +246,7 @@ class Saved:
     """A `Save` that has ended.
 
     Attributes:
-        error: why it failed; "" if it did not. mendable: by the user. fetched: as in `Save`.
+        error: why it failed; "" if it did not. mendable: whether the user can fix that. fetched: as in `Save`.
     """
 
     folder: Path
@@ -293,9 +292,9 @@ class Earth:
     """Where on Earth the map is.
 
     Attributes:
-        survey: what it is georeferenced by; None: nothing.
-        found: how its fixes or points lie on the map; None until that is known.
-        problem: why they cannot lie there, in a sentence.
+        survey: the fixes or control points that georeference it; None: none.
+        found: their alignment with the map; None until it is known.
+        problem: why they cannot be aligned, in a sentence.
     """
 
     survey: Survey | None = None
@@ -304,7 +303,7 @@ class Earth:
 
 
 _NO_POSES, _NO_POSITIONS = np.empty((0, 4, 4)), np.empty((0, 3))
-"""The same objects in all snapshots that have none, which tells the page that nothing has changed."""
+"""Empty values. All snapshots share these objects, which tells the page that nothing has changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +312,7 @@ class Snapshot(Kept):
 
     Attributes:
         session: increases when a recording is opened or restarted. revision: increases with every snapshot.
-        params: as chosen. pending_restart: names of those that take effect on restart only.
+        params: as chosen. pending_restart: names of changed ones that take effect only on restart.
         result: of the newest frame, with the present ground parameters and without its `keyframe`.
         chunks: of all keyframes up to the frame. keyframe_poses: (k, 4, 4) T_map_imu.
         trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops and by
@@ -322,8 +321,8 @@ class Snapshot(Kept):
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
         notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
-        earth: as the map was when the session last stood still.
-        session_file: keeps this session; opening it continues the session. resumed: that was done.
+        earth: for the map as it was when the session last stood still.
+        session_file: keeps this session; opening it continues the session. resumed: whether that was done.
     """
 
     session: int = 0
@@ -364,8 +363,8 @@ class Delta:
     Attributes:
         replaced: new values of fields of `Snapshot`; `loops` without its edges. With `session`, another session
             begins: the reader drops its edges.
-        edges: changed ones. keep: how many of its frames the reader keeps before it appends `frames`.
-        chunks: of the next keyframes, and of earlier ones that have other labels now. notices: new ones.
+        edges: those that changed. keep: how many of its frames the reader keeps before it appends `frames`.
+        chunks: of the next keyframes, and of earlier ones whose labels changed. notices: new ones.
     """
 
     replaced: dict[str, Any]

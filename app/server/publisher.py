@@ -1,7 +1,7 @@
-"""Collects what changes for the page, in the engine's process, and makes deltas of it.
+"""Collects changes for the page, in the engine's process, and makes deltas from them.
 
-Of most fields only the newest value is sent. Frames are followed by a cursor, and clouds are read from disk when sent.
-So a slow reader never delays the engine, misses nothing, and nothing piles up for it.
+Of most fields, only the newest value is sent. A cursor follows the frames, and clouds are read from disk when they are
+sent. So a slow reader never delays the engine and misses nothing, and nothing piles up for it.
 """
 
 import re
@@ -29,7 +29,7 @@ SAVED_KEPT = 10
 
 
 def opened_recording(session: Session) -> OpenedRecording:
-    """Describe a session's source. One without an end is as long as what was processed."""
+    """Describe a session's source. A source without an end is as long as the processed part."""
     info, truth = session.feed.info, session.truth
     newest = session.frames[session.frame] if session.frame >= 0 else None
     so_far_s = (newest.stamp_ns - info.start_ns) * 1e-9 if newest is not None else 0.0
@@ -54,8 +54,8 @@ class Publisher:
         seen: what the reader already has.
 
     Attributes:
-        urgent: asks for the next delta at once, whatever the rate limit.
-        transport: as last shown. result: of the frame that is shown, without its keyframe.
+        urgent: whether the next delta is needed at once, whatever the rate limit.
+        transport: as last shown. result: of the frame shown, without its keyframe.
     """
 
     def __init__(self, params: Params, seen: Seen = NOTHING_SEEN) -> None:
@@ -88,7 +88,7 @@ class Publisher:
         self.urgent = True
 
     def notice_once(self, text: str, stamp_ns: int) -> None:
-        """Warn, unless the same sentence, apart from its numbers, was shown a moment ago."""
+        """Warn, unless the same sentence (numbers aside) was shown a moment ago."""
         kind = re.sub(r"[\d.]+", "#", text)
         last = self._noticed.get(kind)
         if last is None or abs(stamp_ns - last) > REPEAT_AFTER_S * 1e9:
@@ -136,7 +136,7 @@ class Publisher:
         self._chunks = first = min(self._chunks, kept)
         self._chunks = max(first, min(self._chunks_ready, first + CHUNKS_AT_ONCE))
         shown = {index for index in self._again if index < first}
-        again = sorted(filter(self._readable, shown))  # the others once the session is there again
+        again = sorted(filter(self._readable, shown))  # others follow once the session is at their frames again
         chunks = tuple(thinned(self._clouds[index]) for index in (*again, *range(first, self._chunks)))
         delta = Delta(self._replaced, edges, keep, frames, chunks, tuple(self._notices))
         self._replaced, self._notices, self._again, self.urgent = {}, [], shown.difference(again), False
@@ -167,7 +167,7 @@ class Publisher:
             self.notice_once(notice, result.stamp_ns)
 
     def arrived(self, session: Session, result: StepResult | None) -> None:
-        """Show a known frame, to which the session went."""
+        """Show the known frame to which the session went."""
         self._show_frame(session, result)
         stamp_ns = result.stamp_ns if result else 0
         self.show(frame=session.frame, stamp_ns=stamp_ns, finished=session.ended, dropped=session.dropped)
@@ -189,7 +189,7 @@ class Publisher:
         self.put(result=result, urgent=True)
 
     def show_again(self, keyframe: int, *, urgent: bool = True) -> None:
-        """A keyframe has other labels now."""
+        """Send a keyframe again, since its labels have changed."""
         self._again.add(keyframe)
         self.urgent |= urgent
 

@@ -1,4 +1,4 @@
-"""What an engine's process is started with."""
+"""The settings with which an engine's process is started."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,12 +12,12 @@ from app.slam.params import Params
 POINT_BUDGET = 3_000_000
 """Most map points that a page draws."""
 HELD = 3
-"""The server holds this many times as many, 220 MB, so that each page can show in detail what it looks at."""
+"""The server holds this many times as many, 220 MB, so that each page can show details of the part that it views."""
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """How many the reader already has from an earlier process; sessions and notices are numbered on from there."""
+    """Counts that the reader already has from an earlier process; the numbers of sessions and notices continue them."""
 
     session: int = 0
     notices: int = 0
@@ -30,14 +30,14 @@ NOTHING_SEEN = Seen()
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What an engine's process starts with. Must be picklable.
+    """The settings with which an engine's process starts. Must be picklable.
 
     Attributes:
         recording: to open; None: wait for OpenRecording. start_s, duration_s: the part to process.
         resolve, session_folder: see `Controller`. play: begin at once.
         point_budget: most points of the map that a page draws. checkpoint_bytes: memory for checkpoints.
-        live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: keeps what a process that takes
-            over needs. revive: this process takes over. seen: by the reader, before.
+        live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: for files that a process needs
+            to take over. revive: whether this process takes over. seen: counts that the reader already has.
         kept: by a live session that another process began.
     """
 

@@ -9,19 +9,19 @@ from app.server.folders import RECORDINGS, TRAJECTORIES, Folders
 from app.slam.errors import HemislamError
 
 SUFFIXES: Final = (*RECORDINGS, *TRAJECTORIES, ".yaml", ".json")
-"""Recordings and sessions, and what lies beside them: a truth, parameters, an Ouster's metadata."""
+"""Recordings and sessions, and files that belong to them: a truth, parameters, an Ouster's metadata."""
 _LONGEST_NAME: Final = 200
-"""Bytes; file systems allow 255, with what is added."""
+"""Most bytes of a name; with what is added to it, file systems allow 255."""
 _LEFT_FREE: Final = 1 << 30
 """Bytes of the disk that uploads leave free."""
 
 
 def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes, copy: str = "") -> None:
-    """Append a piece of a file to it in the first folder. With its last piece it gets its name.
+    """Append a piece to a file in the first folder. With its last piece, the file gets its name.
 
     Args:
         offset: bytes that came before. size: of the whole file, bytes.
-        copy: letters that tell this copy from others of the same name. The one that begins last goes on.
+        copy: letters that tell this copy from others of the same name. The copy that began last continues.
 
     Raises:
         HemislamError: the name or the size cannot be taken, a piece is missing, or it cannot be written.

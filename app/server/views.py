@@ -1,6 +1,6 @@
 """The session's state as the REST interface sends it.
 
-Fields are read from the values that `Snapshot` holds, by name; what has another name or unit there is converted.
+Fields are read by name from the values in `Snapshot`; those with another name or unit there are converted.
 """
 
 from pathlib import Path

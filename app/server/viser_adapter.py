@@ -1,6 +1,6 @@
 """Everything in app/ that depends on viser's internals.
 
-`tests/server/test_adapters.py` says which of them an upgrade of viser has changed, and that no other module uses any.
+`tests/server/test_adapters.py` shows which of these an upgrade of viser has changed, and that no other module uses any.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from app.export.point_sizes import with_point_sizes
 KEY_HEADER: Final = "X-Hemislam-Key"
 
 MOST_AT_ONCE: Final = 32
-"""Updates in one message to a page. viser would send 128, and each message is copied several times for every page."""
+"""Most updates in one message to a page. viser would send 128, and each message is copied several times per page."""
 
 CLIENT: Final = Path(viser.__file__).parent / "client" / "build" / "index.html"
 """viser's page: one file that holds everything."""
@@ -77,7 +77,7 @@ def start_viser() -> Viser:
 
 
 def _list_icons_once() -> None:
-    """viser reads the list of its 4,000 icons again for each icon: most of the time in which a page is built."""
+    """Read viser's list of 4,000 icons once. viser reads it for each icon, which takes most of a page's build time."""
     icons = zipfile.ZipFile(viser._icons.ICONS_DIR / "tabler-icons.zip")
     viser._icons.zipfile = SimpleNamespace(ZipFile=lambda path: contextlib.nullcontext(icons))  # type: ignore[assignment,attr-defined]
 

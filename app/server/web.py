@@ -1,4 +1,4 @@
-"""The one public port: viser's page, the bridge to viser, and the REST interface."""
+"""The only public port: viser's page, the bridge to viser, and the REST interface."""
 
 import asyncio
 import contextlib
@@ -38,7 +38,7 @@ from app.slam.errors import HemislamError
 log = logging.getLogger(__name__)
 
 MOST_PAGES: Final = 32
-"""Open pages with the view-only token, and as many others. Each takes a megabyte or two."""
+"""Most open pages with the view-only token, and again as many others. Each takes a megabyte or two."""
 MOST_CONNECTIONS: Final = 500
 """Beyond that, requests are answered with status 503."""
 
@@ -72,7 +72,7 @@ def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Acc
     app.add_middleware(Guard, access=access)
     page = page_html()
     viewers_page = viewer_html(page)
-    pages: Counter[bool] = Counter()  # open ones, by whether they are view only
+    pages: Counter[bool] = Counter()  # open pages, by whether they are view only
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     def index(request: Request) -> str:
@@ -161,13 +161,13 @@ def run_server(
         if open_browser and has_display():
             webbrowser.open(address)  # the listener holds the request until the server is up
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with contextlib.suppress(KeyboardInterrupt):  # uvicorn ends in order, then raises the signal again
+        with contextlib.suppress(KeyboardInterrupt):  # uvicorn shuts down cleanly, then raises the signal again
             server.run(sockets=[listener])
         log.info("Ending")
 
 
 def log_notices(engine: RunningEngine) -> None:
-    """Log the notices that the engine publishes, without end. For a thread of its own."""
+    """Log the notices that the engine publishes, without end. Run this in a thread of its own."""
     if not log.isEnabledFor(logging.INFO):
         return  # people read them on the page
     logged: set[int] = set()

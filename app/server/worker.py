@@ -1,6 +1,6 @@
 """The engine in a process of its own, started and watched from here.
 
-The process sends the next delta when the last one was acknowledged. So a slow reader gets few large deltas.
+The process sends the next delta when the last one has been acknowledged. So a slow reader gets few large deltas.
 """
 
 import math
@@ -16,7 +16,7 @@ from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecordi
 from app.server.setup import HELD, Seen, Setup
 
 MOST_RESTARTS: Final = 25
-"""Deaths of the engine's process after which it is started again without being asked."""
+"""Most deaths after which the engine's process is restarted automatically."""
 
 Main = Callable[[Link, Setup], None]
 
@@ -28,7 +28,7 @@ def _run_engine(owner: Link, setup: Setup) -> None:
 
 
 class RunningEngine(Protocol):
-    """An engine's process as its users know it: `EngineProcess`, or the workspace of two."""
+    """The interface of an engine's process: `EngineProcess`, or the workspace of two."""
 
     @property
     def snapshot(self) -> Snapshot: ...
@@ -72,7 +72,7 @@ class EngineProcess:
     def send(self, command: Command) -> None:
         """Enqueue a command. Restart and OpenRecording start a dead engine again; other commands to it are lost."""
         if isinstance(command, Restart | OpenRecording):
-            with self._restarting:  # the second one finds it alive
+            with self._restarting:  # a second caller finds the process alive
                 if not self.snapshot.engine_alive:
                     self.restart(command)
                     return
@@ -93,7 +93,7 @@ class EngineProcess:
         self._edit(engine_alive=True)
 
     def close(self, timeout: float | None = None) -> None:
-        """Let the process finish what it is writing and end; kill it after the time (s)."""
+        """Let the process finish writing and end; kill it after the time (s)."""
         child, self._child = self._child, None  # from now on its end is expected
         if child is not None:
             child.close(timeout)
@@ -118,7 +118,7 @@ class EngineProcess:
                 self._died(death)
 
     def _died(self, death: ChildDied) -> None:
-        """Report it, and start the process again if its session was kept."""
+        """Report the death, and start the process again if its session was kept."""
         last = self.snapshot
         place = last.session_file or (LIVE if last.live is not None else None)
         restarts = place is not None and self._restarts.allows()
@@ -129,13 +129,13 @@ class EngineProcess:
             self._edit(engine_alive=False, progress=None, transport=transport, notices=notices)
             return
         self._edit(notices=notices, progress=Progress("Starting the engine again", math.nan))
-        on_the_way = last.progress is not None or last.transport.frame < 0  # to the frame of the process before
+        on_the_way = last.progress is not None or last.transport.frame < 0  # to the previous process's frame
         setup = self._next_setup(play=self._started_with.play if on_the_way else last.transport.playing)
         seen = replace(setup.seen, frames=len(last.trajectory), chunks=len(last.chunks))
         self._start(replace(setup, recording=place, revive=True, seen=seen))
 
     def _next_setup(self, *, play: bool) -> Setup:
-        """What the next process starts with: parameters and settings as they are now."""
+        """The setup of the next process: parameters and settings as they are now."""
         last = self.snapshot
         return replace(
             self._setup,
