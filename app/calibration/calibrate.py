@@ -1,5 +1,5 @@
-"""From a recording to the pose of the LiDAR on the IMU and the corrections of its scan lines: odometry by scans alone,
-then with the IMU's own help."""
+"""From a recording to the pose of the LiDAR on the IMU and the corrections of its scan lines: first by odometry from
+scans alone, then with the help of the IMU."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,21 +24,21 @@ from app.slam.start import DRAWN
 from app.slam.types import F64
 
 ROUNDS = 3
-"""Rounds in which the scans are registered again with the IMU's help; each round improves the fit, and so the help."""
+"""Rounds in which the scans are registered again with the help of the IMU; each improves the fit, and so the help."""
 READING, ROUND = 0.1, 0.9 / (ROUNDS + 1)
 LARGEST_ROTATION, LARGEST_PLACE, LARGEST_OFFSET = np.radians(1.0), 0.05, 0.002
 """rad, m, s: values with a larger standard deviation count as not observable."""
 NOT_TURNED = np.radians(20.0)
-"""rad: where scans alone leave every axis of the rotation this open, the IMU would help in a wrong direction."""
+"""rad: if scans alone leave every axis of the rotation this uncertain, the help of the IMU would mislead."""
 SURE = 3.0
-"""Standard deviations by which two values must differ to be different."""
+"""Standard deviations by which two values must differ to count as different."""
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1
 """rad, m: a mounting that is off by more than this spoils a map."""
 POSED = "sensor.rotation", "sensor.translation", "recording.imu_time_offset"
 """Parameters that say where the LiDAR is on the IMU, and when."""
 
 Report = Callable[[float], None]
-"""Is called with the fraction done, 0-1."""
+"""A function that is called with the fraction done, 0-1."""
 
 
 class MirroredError(HemislamError):
@@ -51,12 +51,12 @@ def is_mounting_unknown(params: Params) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a recording shows about its sensors. `params` are those that it was opened with.
+    """What a recording shows about its sensors.
 
     Attributes:
-        recording: the file. params: what was taken so far. lasted_s: the part that was used.
-        preset: from which the mounting in `params` is, as none was given; "" if it was.
-        turned, moved: the fits. down: (3,) unit direction of gravity in the LiDAR frame at the begin.
+        recording: the file. params: those that it was opened with. lasted_s: the part that was used.
+        preset: the source of the mounting in `params`, if none was given; "" if one was.
+        turned, moved: the fits. down: (3,) unit direction of gravity in the LiDAR frame at the start.
         residuals: m, RMS of the scans to the map without the IMU, and with it.
         gyro_noise, accel_noise: of the IMU in most seconds, vibrations included.
         lines: corrections of the scan lines.
@@ -102,8 +102,8 @@ class Calibration:
 
     @property
     def mounting(self) -> tuple[F64, F64]:
-        """R_imu_lidar (3, 3) and p_imu_lidar (3,) to take from now on: the mean of what was given and what was found,
-        weighted by their variances. What was found counts alone if nothing was given, or if that is surely wrong."""
+        """R_imu_lidar (3, 3) and p_imu_lidar (3,) to use from now on: the mean of the given and the fitted values,
+        weighted by their variances; the fitted ones alone if none were given, or if the given ones are surely wrong."""
         sensor, parts = self.params.sensor, []
         R, p = lie.from_rpy_degrees(sensor.rotation), np.array(sensor.translation)
         off = lie.log(R.T @ self.turned.R_imu_lidar), self.moved.p_imu_lidar - p
@@ -115,8 +115,8 @@ class Calibration:
         return R @ lie.exp(parts[0]), p + parts[1]
 
     def found(self) -> dict[str, Any]:
-        """Parameters to take from now on, by dotted name: what the recording determines, and what was given of
-        mounting and clock beside it, so that a file of them needs no other. {} if it determines nothing."""
+        """Parameters to use from now on, by dotted name: those that the recording determines, and the given values of
+        the rest of mounting and clock, so that a file of them is complete. {} if it determines nothing."""
         (R, p), observed = self.mounting, self.observed
         values: dict[str, Any] = {}
         if observed["rotation"]:
@@ -132,8 +132,8 @@ class Calibration:
         return posed | values if values or self.preset else {}
 
     def contradiction(self) -> str:
-        """What is wrong with the mounting or the clock taken so far, in a sentence; "" if nothing is, or if
-        that cannot be determined. Where none was given: the preset that has it."""
+        """What is wrong with the mounting or the clock used so far, in a sentence; "" if nothing is, or if this
+        cannot be determined. If no mounting was given, it names the preset that has it."""
         (R, p), sensor, observed, parts = self.mounting, self.params.sensor, self.observed, []
         turned = np.linalg.norm(lie.log(lie.from_rpy_degrees(sensor.rotation).T @ R))
         if observed["rotation"] and turned > APART_ROTATION:
@@ -180,7 +180,7 @@ def calibrate(
 def calibrate_excerpt(
     path: Path, params: Params, excerpt: Excerpt, progress: Report = lambda fraction: None, preset: str = ""
 ) -> Calibration:
-    """As `calibrate`, of what was read already. preset: from which the mounting in `params` is."""
+    """As `calibrate`, from a part that was already read. preset: the source of the mounting in `params`."""
     inertial = Inertial(excerpt.seconds(excerpt.imu.stamps_ns), excerpt.imu.gyro, excerpt.imu.accel)
     given = lie.from_rpy_degrees(params.sensor.rotation), np.array(params.sensor.translation, np.float64)
 

@@ -1,4 +1,4 @@
-"""A recording as calibration needs it: what the engine gets of it, its scans thinned to a few thousand points."""
+"""A recording as calibration needs it: the engine's input, with scans thinned to a few thousand points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ PAUSE_NS = 5_000_000_000
 LEAST_SCANS = 50
 REST_S = 1.0
 VOXEL = 0.3
-"""m; of each voxel the first point stays, with its own time."""
+"""m: edge of the voxels of which only the first point stays, with its own time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def read_excerpt(
         progress: called with the fraction read, 0-1.
 
     Raises:
-        HemislamError: too short, or damaged from the start.
+        HemislamError: the recording is too short, or damaged from the start.
     """
     measurements: list[Measurement] = []
     grid = VoxelGrid()
@@ -96,7 +96,7 @@ def _longest_part(measurements: list[Measurement]) -> list[Measurement]:
 
 
 def _sets_off_ns(imu: ImuSamples) -> int:
-    """REST_S before the IMU first moves; a map of many scans from one place would hold the LiDAR there."""
+    """Time, ns, REST_S before the IMU first moves. A map of many scans from one place would hold the LiDAR there."""
     rest_ns = round(REST_S * 1e9)
     for begin in range(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), rest_ns // 4):
         part = slice(*np.searchsorted(imu.stamps_ns, [begin, begin + rest_ns // 2]))
@@ -106,7 +106,7 @@ def _sets_off_ns(imu: ImuSamples) -> int:
 
 
 def _samples(measurements: list[Measurement]) -> ImuSamples:
-    """Each once; those of the first measurement may come from before a pause, and are left out."""
+    """All samples, each once, without those of the first measurement, which may be from before a pause."""
     parts = [measurement.imu for measurement in measurements[1:]] or [m.imu for m in measurements]
     stamps_ns, first = np.unique(np.concatenate([part.stamps_ns for part in parts]), return_index=True)
     gyro, accel = (np.concatenate([getattr(part, name) for part in parts]) for name in ("gyro", "accel"))

@@ -41,7 +41,7 @@ class Guide:
         return cls(steady, attitudes, R_imu_lidar, zero if p_imu_lidar is None else p_imu_lidar, gravity)
 
     def course(self, end: float, back: F64, R_world_lidar: F64) -> Course:
-        """How the LiDAR came to its pose at the time `end` s.
+        """The motion of the LiDAR to its pose at the time `end` s.
 
         Args:
             back: (k,) s, ascending to 0. R_world_lidar: (3, 3) at the first of these times.
@@ -50,7 +50,7 @@ class Guide:
         return Course(back, turned, *self._swayed(end, back, R_world_lidar @ turned[0].T))
 
     def _swayed(self, end: float, back: F64, R_world_lidar: F64) -> tuple[F64, F64]:
-        """How far (k, 3) m and how fast (k, 3) m/s the LiDAR was off a motion of constant velocity that it had at the
+        """Deviation of the LiDAR, (k, 3) m and (k, 3) m/s, from a motion at the constant velocity that it had at the
         end; in its frame at the end.
 
         Args:

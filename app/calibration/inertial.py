@@ -8,9 +8,9 @@ from app.slam import lie
 from app.slam.types import F64
 
 SUBSTEPS = 20
-"""Of a gyroscope between two scans."""
+"""Number of integration steps of a gyroscope between two scans."""
 DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
-"""Weights of five samples in turn: of a hand's motion they leave a thousandth, of white noise all."""
+"""Weights of five successive samples: they leave a thousandth of a hand's motion, but all of the white noise."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,13 +1,13 @@
 """Systematic errors of each scan line, from how well the points of all lines lie on common planes.
 
-In windows of a few seconds the map is cut into cubes. In a flat one the points of all lines and scans must lie on one
+In windows of a few seconds the map is cut into cubes. In a flat cube, the points of all lines and scans must lie on one
 plane. The unknowns are the corrections of the lines, a pose of each scan and a plane of each cube. Poses and planes are
 eliminated, so that linear least squares for the corrections remain (as in bundle adjustment of planes, Liu & Zhang
 2021, "BALM").
 
-Errors that all lines share, or that change linearly from the lowest line to the highest, are held at zero. Beams that
-graze a surface return from farther off with every LiDAR, which looks the same: on simulated scanners with such beams,
-these shares came out wrong by centimetres.
+Errors that all lines share, or that change linearly from the lowest line to the highest, are held at zero. With every
+LiDAR, beams that graze a surface measure too long distances, which looks the same as such errors: on simulated scanners
+with grazing beams, these parts came out wrong by centimetres.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from app.slam.kernels.registration import EDGE_ON
 from app.slam.types import F64, I64, U16
 
 WINDOW, CUBE, EVERY = 60, 1.0, 4
-"""Scans of a window; m, edge of a cube; of how many points one is used."""
+"""Number of scans of a window; edge of a cube, m; every how many points one is used."""
 FEWEST, THICKEST, FLAT = 15, 0.05, 3.0
 """A plane has at least this many points, is at most this thick (m), and is wider than thick by this factor."""
 OUTLIER = 3.0
@@ -38,7 +38,7 @@ LOOSE = 1.0
 SURE, LEAST = 3.0, (np.radians(0.03), 0.003)
 """Corrections are worth applying if their RMS exceeds this many times their uncertainty, and these values (rad, m)."""
 DIGITS = 3, 4
-"""Of a correction in deg, and in m."""
+"""Decimals of a correction in deg, and in m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Lines:
         return replace(excerpt, scans=scans)
 
     def found(self) -> dict[str, str]:
-        """The parameters that apply what is worth it."""
+        """The parameters for corrections that are worth applying."""
         values = {}
         names, scales = ("elevation_corrections", "range_corrections"), (np.degrees(1.0), 1.0)
         for k, line in enumerate((self.elevations, self.ranges)):
@@ -83,7 +83,7 @@ def fit_lines(excerpt: Excerpt, track: Track, so_far: Lines) -> Lines:
     """Corrections beyond those that the scans of the excerpt already have.
 
     Args:
-        track: of this excerpt. so_far: what it is corrected by.
+        track: of this excerpt. so_far: the corrections that it already has.
     """
     count = len(so_far.elevations)
     votes, squares, hits = [], np.zeros(count), np.zeros(count)
@@ -122,8 +122,8 @@ class _Window:
     Attributes:
         off: (n,) m, from the plane. scan: (n,) number in the window. ring: (n,). cube: (n,) number of its plane.
         normals, arms: (n, 3) of the plane, and m from the LiDAR; world.
-        basis: (n, 3) how the plane's offset and its two tilts move the point; over a cube an orthonormal basis.
-        beams, raised: (n, 3) change of the point for a longer beam, and m for one raised by a radian; world.
+        basis: (n, 3) effect of the plane's offset and two tilts on the point; an orthonormal basis over each cube.
+        beams, raised: (n, 3) change of the point per m of a longer beam, and m per rad of a raised beam; world.
     """
 
     off: F64
@@ -189,8 +189,8 @@ def _columns(width: int, *parts: tuple[I64, F64]) -> Any:
 
 
 def _planes(places: F64, cube: I64, used: npt.NDArray[np.bool_]) -> tuple[F64, F64, F64, npt.NDArray[np.bool_]]:
-    """Of each cube: center (c, 3) m; axes (c, 3, 3) as columns with the normal first; the lengths (c, 3) of a one for
-    each point, and of their places along the other two axes; and whether it is flat."""
+    """For each cube: center (c, 3) m; axes (c, 3, 3) as columns with the normal first; norms (c, 3) of a vector of ones
+    over its points, and of their coordinates along the other two axes; and whether it is flat."""
     total = int(cube.max()) + 1
     there = cube[used]
     hits = np.bincount(there, minlength=total)

@@ -1,5 +1,5 @@
-"""The path of the LiDAR from its scans: each is registered to the map of the earlier ones, as the engine does without
-an IMU (`app.slam.coast`)."""
+"""The path of the LiDAR from its scans: each scan is registered to the map of the earlier ones, as the engine does
+without an IMU (`app.slam.coast`)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from app.slam.params import Params
 from app.slam.types import F32, F64
 
 GYRO = 0.05
-"""rad/√s, noise of the turning by gyroscope."""
+"""rad/√s, noise of turns by the gyroscope."""
 AROUND_S = 0.15
 """How far the clocks of the sensors may be apart."""
 LEAST_CHANGES = (0.05, 0.2)
@@ -56,7 +56,7 @@ def track(
     local_map = LocalMap(params.map)
     times = excerpt.seconds(excerpt.ends_ns)
     here = coast.standing(excerpt.scans[0].end_ns, np.eye(3), params)
-    if guide is not None:  # it gives the turns, so no rate is beside them
+    if guide is not None:  # it gives the turns, so there is no additional rate
         here.covariance[BG, BG] = 1e-12 * np.eye(3)
     states, residuals, clouds = [here.state], [float("nan")], [excerpt.scans[0].points]
     local_map.insert(excerpt.scans[0].points, np.zeros(3), params.map)
@@ -84,7 +84,7 @@ def track(
 
 
 def _changes(excerpt: Excerpt, end_ns: int) -> tuple[float, float]:
-    """How fast a scan's rates may change by the IMU (rad/s and m/s², norms, so that its mounting does not matter)."""
+    """How fast a scan's rates may change, by the IMU (rad/s and m/s²; norms, so that its mounting does not matter)."""
     around = np.searchsorted(excerpt.imu.stamps_ns, end_ns + np.array([-AROUND_S - 0.1, AROUND_S]) * 1e9)
     gyro, accel = excerpt.imu.gyro[slice(*around)], excerpt.imu.accel[slice(*around)]
     if len(gyro) < 3:

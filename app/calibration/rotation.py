@@ -13,14 +13,14 @@ from app.slam.types import F64, I64
 LATEST_S, STEP_S = 0.5, 0.01
 """Clock offsets that are tried."""
 FAR = np.radians(1.5)
-"""Turns that differ by more between two scans are taken as errors of the odometry."""
+"""If the turns between two scans differ by more, this is taken as an error of the odometry."""
 WIDEST = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])
-"""Standard deviations of rotation (rad), offset (s) and bias (rad/s) where nothing determines them."""
+"""Standard deviations of rotation (rad), offset (s) and bias (rad/s) if nothing determines them."""
 STEPS, SLIPPED = 20, 3.0
 """Most steps of the fit; windows whose differences exceed this many times the usual ones are errors of the odometry."""
 CLEARLY = 0.5
-"""The IMU counts as mirrored if its turns, seen in a mirror, differ from the LiDAR's by less than this share of how
-much they differ as they are."""
+"""The IMU counts as mirrored if mirroring its turns reduces their difference from the LiDAR's to less than this
+share."""
 WINDOW = 10
 """Scans over which attitudes are compared: a second. The gyroscope's noise grows with it, the odometry's does not."""
 
@@ -66,7 +66,7 @@ def first_rotation(track: Track, inertial: Inertial, late: float) -> F64:
 
 
 def is_mirrored(track: Track, inertial: Inertial, late: float) -> bool:
-    """Whether the IMU turns as the LiDAR does in a mirror, which no mounting explains."""
+    """Whether the IMU's turns are the mirror image of the LiDAR's, which no mounting explains."""
     ours, theirs = _vectors(track, inertial, late)
     right, mirrored = (
         np.median(np.linalg.norm(signed - ours @ _aligned(ours, signed).T, axis=1)) for signed in (theirs, -theirs)
@@ -115,7 +115,7 @@ def fit_rotation(track: Track, inertial: Inertial, R: F64, late: float, given: F
         spread = 1.48 * np.median(np.abs(off[kept])) + 1e-9
         root = (1.0 + (off[kept].ravel() / spread) ** 2) ** -0.25  # Barron's "soft L1"
         J = _jacobian(differences_kept, x).reshape(-1, 7)
-        rows = np.vstack([J * root[:, None], np.diag(spread / WIDEST)])  # else what nothing determines runs away
+        rows = np.vstack([J * root[:, None], np.diag(spread / WIDEST)])  # else undetermined values would diverge
         step = np.linalg.lstsq(rows, -np.append(off[kept].ravel() * root, spread / WIDEST * x), rcond=None)[0]
         x = x + step
         off = differences(x)
@@ -130,8 +130,8 @@ def fit_rotation(track: Track, inertial: Inertial, R: F64, late: float, given: F
 def clustered(J: F64, residuals: F64, widest: F64) -> F64:
     """Covariance (p, p) of a least-squares fit whose residuals (w, m) are independent between, not within, w windows.
 
-    J: (w, m, p). widest: (p,) standard deviations of what is not observed. The larger of the two: with equal noise
-    everywhere, and by how the windows disagree (Liang & Zeger 1986, the sandwich estimator).
+    J: (w, m, p). widest: (p,) standard deviations of unobserved values. The result is the larger of two estimates: with
+    equal noise everywhere, and by how the windows disagree (Liang & Zeger 1986, the sandwich estimator).
     """
     variance = float(np.sum(residuals**2)) / max(residuals.size - J.shape[2], 1) + 1e-18
     plain = np.linalg.inv(np.einsum("wmp,wmq->pq", J, J) / variance + np.diag(widest**-2.0))

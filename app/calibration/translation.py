@@ -1,7 +1,7 @@
 """The position of the LiDAR on the IMU, gravity and the accelerometer's bias, from how both move.
 
-In windows of a few scans the IMU's accelerations, integrated twice, must give the LiDAR's positions: up to a position,
-a velocity and gravity of each window. All unknowns are linear, since the attitudes are known by then.
+In windows of a few scans, the IMU's accelerations, integrated twice, must give the LiDAR's positions, except for an
+initial position, a velocity and gravity in each window. All unknowns are linear, since the attitudes are already known.
 """
 
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from app.slam.types import F64, I64
 WINDOW = 15
 """Scans of a window."""
 BIAS, TILT = 0.3, 0.02
-"""m/s²: how large an accelerometer's bias may be; and how much gravity may seem to turn from a window to the next, as
-the odometry drifts."""
+"""m/s²: how large an accelerometer's bias may be, and how much gravity may seem to change from one window to the next
+as the odometry drifts."""
 WIDEST = np.array([10.0, 10.0, 10.0, BIAS, BIAS, BIAS])
-"""Standard deviations of position (m) and bias (m/s²) where nothing determines them."""
+"""Standard deviations of position (m) and bias (m/s²) if nothing determines them."""
 HUBER = 1.5
 """Windows whose residuals exceed this many times the usual ones count for less."""
 
@@ -30,7 +30,7 @@ class Moved:
     """How the IMU moves with the LiDAR.
 
     Attributes:
-        p_imu_lidar: (3,) m. bias: (3,) m/s² of the accelerometer. gravity: (3,) m/s² in the world, at the begin.
+        p_imu_lidar: (3,) m. bias: (3,) m/s² of the accelerometer. gravity: (3,) m/s² in the world, at the start.
         covariance: (6, 6) of position and bias.
         before, after: (n, 3) m, differences of the LiDAR's positions from those of the IMU: as given, and as fitted.
     """
@@ -60,7 +60,7 @@ def fit_translation(track: Track, inertial: Inertial, turned: Turned, given: F64
     q, _ = np.linalg.qr(free)
 
     def rest(a: F64) -> F64:
-        """The part that no initial position and no velocity explains."""
+        """The part that an initial position and a velocity cannot explain."""
         return np.asarray(a - q @ (np.swapaxes(q, 1, 2) @ a))
 
     design, falls, target = rest(design), rest(falls), rest(target[:, :, None])[:, :, 0]
@@ -100,8 +100,8 @@ def _solved(design: F64, falls: F64, target: F64, weights: F64) -> tuple[F64, F6
 
 
 def _integrated(track: Track, inertial: Inertial, turned: Turned, windows: I64) -> tuple[F64, F64, F64, F64]:
-    """For each scan of each window: s since its begin (w, n), attitude of the IMU (w, n, 3, 3), the way by its forces
-    (w, n, 3) m, and how a bias changes that (w, n, 3, 3)."""
+    """For each scan of each window: s since its start (w, n), attitude of the IMU (w, n, 3, 3), displacement by its
+    forces (w, n, 3) m, and the change of this per bias (w, n, 3, 3)."""
     w, n = windows.shape
     times = track.times[windows]
     seen = track.rotations[windows] @ turned.R_imu_lidar.T

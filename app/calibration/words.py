@@ -21,7 +21,7 @@ WALK = "not observable: walk a figure of eight, tilting the scanner"
 
 
 def table(calibration: Calibration) -> list[tuple[str, str]]:
-    """What was found, each with its unit and standard deviation."""
+    """The results, each with its unit and standard deviation."""
     c, sigmas, observed = calibration, calibration.sigmas, calibration.observed
     roll, pitch, yaw = c.rotation
     x, y, z = c.moved.p_imu_lidar
@@ -50,8 +50,8 @@ def table(calibration: Calibration) -> list[tuple[str, str]]:
 
 
 def as_json(calibration: Calibration) -> dict[str, Any]:
-    """The same as numbers; units as in the parameters, standard deviations in rad, s, m, rad/s and m/s²; of the noise
-    density and its standard deviation."""
+    """The same as numbers. Units as in the parameters; standard deviations in rad, s, m, rad/s and m/s². The noise has
+    its density and the standard deviation of that."""
     c = calibration
     numbers: dict[str, Any] = {
         "recording": str(c.recording),
@@ -90,12 +90,12 @@ def check_beside(recording: Path) -> None:
 
 
 def write_beside(recording: Path, found: Mapping[str, Any]) -> Path:
-    """Store what was found, by dotted name, beside the recording, where `run`, `serve` and `info` read it.
+    """Store the found parameters, by dotted name, beside the recording, where `run`, `serve` and `info` read them.
 
     A file that a person wrote is kept as `.old`, and its other parameters stay.
 
     Raises:
-        HemislamError: nothing was found; or the file cannot be written, and the older one stays.
+        HemislamError: nothing was found; or the file cannot be written, and then the older one stays.
     """
     if not found:
         raise HemislamError(f"Nothing that was found in {recording} can be kept: {WALK}.")

@@ -27,7 +27,7 @@ from app.slam.errors import HemislamError
 from app.slam.trajectory import Trajectory
 
 COARSE_S = 0.2
-"""Steps in which the clocks' offset is first looked for, over `SEARCH_S` on either side."""
+"""Step of the first search for the clocks' offset, over `SEARCH_S` on either side."""
 MOST_SIGMAS = 4.03
 """Standard deviations within which 99.9 % of sound fixes lie (a Gaussian in three directions)."""
 MEDIAN_SIGMAS = 1.538
@@ -35,15 +35,15 @@ MEDIAN_SIGMAS = 1.538
 LEVEL = np.radians(0.5)
 """Standard deviation of the map's tilt before any fix: that of an accelerometer biased by 0.09 m/s²."""
 NEARBY_S = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6)
-"""Added to it where the lever arm is unknown too: an antenna ahead of the IMU looks much like an early clock."""
+"""Offsets to try around the first one if the lever arm is unknown too: an antenna ahead looks like an early clock."""
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
-"""What is less certain than this (standard deviation) is not taken from the fixes."""
+"""Values that are less certain than this (standard deviation) are not taken from the fixes."""
 NOTABLE_SCATTER = 3.0
-"""A user is told of more, as a factor on what the fixes report."""
+"""Scatter above which the user is told, in multiples of the standard deviations that the fixes report."""
 FEWEST = 8
 COARSE_FIXES = 200
 MOST_STEPS = 50
-"""Of one fit. Sound fixes take up to 30; those that do not follow the trajectory would take hundreds."""
+"""Most steps of one fit. Sound fixes take up to 30; fixes that do not follow the trajectory would take hundreds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Alignment:
         offset_s: how much later the fixes are stamped than they were measured. lever_arm: m, IMU frame.
         offset_sigma_s, yaw_sigma, lever_sigma: their standard deviations, s, rad and m; nan where a value was given.
             They count noise of the fixes and drift of the map.
-        notes: what a user should know, in sentences.
+        notes: for the user, in sentences.
     """
 
     reference: GeoReference
@@ -75,7 +75,7 @@ class Alignment:
 
     @property
     def rms(self) -> F64:
-        """(3,) m to the east, north and up, of what counts."""
+        """(3,) m to the east, north and up, of the fixes or points that count."""
         return np.asarray(np.sqrt((self.residuals[self.used] ** 2).mean(axis=0)))
 
 
@@ -89,7 +89,7 @@ def align(
     offset_s: float | None = None,
     overridden: Mapping[str, bool] = MappingProxyType({}),
 ) -> Alignment:
-    """Find where a trajectory lies by fixes that are in order of time; those before and after it do not matter.
+    """Align a trajectory with fixes, which are in order of time; fixes before and after it are ignored.
 
     Args:
         trajectory: T_map_imu with z up. grid: a projected system; "": the UTM zone there. height: what the heights of
@@ -98,7 +98,7 @@ def align(
             names count, whatever their residuals.
 
     Raises:
-        HemislamError: fixes do not fit the trajectory in time or place, or determine no heading; `lever` is not finite.
+        HemislamError: fixes do not fit the trajectory in time or place, or leave the heading open; `lever` not finite.
     """
     if lever is not None and not np.isfinite(lever).all():
         raise HemislamError(f"A lever arm of {lever} is none; give three numbers of metres.")
@@ -175,7 +175,7 @@ def align(
 
 
 def overrides_of(overridden: Mapping[str, bool], names: Sequence[str]) -> F64:
-    """(n,) 1 where the user counts what has this name, 0 where they leave it out, nan elsewhere."""
+    """(n,) 1 where the user counts the fix or point of this name, 0 where they leave it out, nan elsewhere."""
     return np.array([float(overridden.get(name, np.nan)) for name in names], np.float64)
 
 
@@ -198,12 +198,12 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """What is known: (n,) times, (n, 3) places on the ground and their sigmas.
+    """The input of an alignment: (n,) times, (n, 3) places on the ground and their sigmas.
 
     Attributes:
         overrides: (n,) 1 or 0 where the user says that a fix counts or does not, nan elsewhere.
-        lever: m, IMU frame, as given. offset: s, to start from; None: there is none.
-        lever_free: whether the lever arm is to be found instead.
+        lever: m, IMU frame, as given. offset: s, to start from; None: not estimated.
+        lever_free: whether the lever arm is estimated instead.
     """
 
     path: PathOverTime
@@ -258,7 +258,7 @@ class _Problem:
         return np.asarray(np.r_[yaw, shift, 0.0, 0.0, [offset] * late, [0.0] * (3 * free)], np.float64)
 
     def with_drift(self, solved: _Solved) -> _Solved:
-        """The same, with standard deviations that count drift, and constants of the receiver that it hardly pulls."""
+        """The same, with drift in the standard deviations and with receiver constants that drift hardly affects."""
         used, x, residuals = solved.used, solved.x, solved.residuals[solved.used]
         J = self._jacobian(x, used)
         sigmas, seconds = self.sigmas[used], self.seconds[used]
@@ -271,7 +271,7 @@ class _Problem:
         )
         if self.offset is None:
             return found
-        but_shift = np.r_[0, 4 : len(x)]  # drift takes its place
+        but_shift = np.r_[0, 4 : len(x)]  # drift replaces the shift
         per_unit = J[:-2].reshape(*residuals.shape, -1)[..., but_shift] * sigmas[..., None]
         expected = np.full(len(but_shift), np.inf)
         expected[1:3] = LEVEL
@@ -310,7 +310,7 @@ class _Problem:
         return np.stack(columns, axis=1) / 2e-5
 
     def _fit_robustly(self, start: F64) -> Any:
-        """SciPy's result, by all fixes but those that the user leaves out."""
+        """SciPy's result, by all fixes except those that the user leaves out."""
         return _fit(self._whitened, start, loss="cauchy", f_scale=2.0, args=(self.overrides != 0,))
 
     def _robust(self, start: F64) -> tuple[F64, Mask]:
@@ -348,7 +348,7 @@ def _fit(errors: Any, start: F64, **loss: Any) -> Any:
 
 
 def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search: bool = True) -> tuple[float, float]:
-    """The offset (s; 0 without a search) with which the fixes fit best, and how far off (m) they are in the median."""
+    """The offset (s; 0 without a search) with which the fixes fit best, and their median distance (m)."""
     few = _evenly(len(seconds))
     best = (np.inf, 0.0, np.inf)
     offsets = np.arange(-SEARCH_S, SEARCH_S + COARSE_S / 2, COARSE_S) if search else np.zeros(1)
@@ -364,7 +364,7 @@ def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search
 
 
 def _evenly(count: int) -> I64:
-    """Rows of at most `COARSE_FIXES` of so many."""
+    """Indices of at most `COARSE_FIXES` of `count` fixes, evenly spread."""
     return np.unique(np.linspace(0, count - 1, COARSE_FIXES).astype(np.int64))
 
 
@@ -378,7 +378,7 @@ def _too_few(path: PathOverTime, seconds: F64) -> HemislamError:
 def _refuse_unlike(solved: _Solved, places: F64) -> None:
     """Raises HemislamError if the fixes at these places (n, 3) fit the trajectory no better than a point would."""
     path = (places - solved.residuals)[solved.used]
-    extent = float(np.sqrt(((path - path.mean(axis=0)) ** 2).sum(axis=1).mean()))  # not of most: they may stand still
+    extent = float(np.sqrt(((path - path.mean(axis=0)) ** 2).sum(axis=1).mean()))  # no median: most may stand still
     off = float(np.sqrt((solved.residuals[solved.used] ** 2).sum(axis=1).mean()))
     if off > 0.5 * extent:
         raise HemislamError(

@@ -3,8 +3,9 @@
     g = T_map_imu @ (T_keyframe_then @ lever)        the antenna, carried to the time of the fix by odometry
 
 Fixes that do not fit even a bent map are rejected, unless the user counts them. The fixes also determine how stiff the
-graph is: those of some stretches must predict those of the others. The clocks' offset is estimated with the bent map,
-unless it was given, and then the graph is never very stiff: to such a graph, slow drift by millimetres is an offset.
+graph is: fixes of some stretches must predict those of the other stretches. If the clocks' offset is not given, it is
+estimated together with the bent map. Then the graph is never very stiff: a very stiff graph would turn slow drift by
+millimetres into an offset.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,7 @@ seconds; along the walk, it looks like an offset of a millisecond."""
 STRETCH_S = 3.0
 """Fixes of every other stretch predict those between them."""
 STEP_S, EXACT_S, FARTHEST_S = 2e-3, 1e-5, 2.0
-"""Of the search for the clocks' offset: its first step, its end, and how far from that of the alignment it may end."""
+"""s, of the search for the clocks' offset: first step, last step, and largest distance from the alignment's offset."""
 
 
 def bend(
@@ -99,7 +100,7 @@ class _Problem:
 
     Attributes:
         path: the trajectory before. stamps_ns: (k,) of the keyframes. keyframes: (k, 4, 4) T_map_imu before.
-        found: the alignment, whose n fixes are meant wherever (n,) stands.
+        found: the alignment. Below, (n,) refers to its n fixes.
     """
 
     path: PathOverTime
@@ -110,13 +111,13 @@ class _Problem:
     found: Alignment
 
     def priors(self, offset_s: float) -> list[PositionPrior]:
-        """(n,) if the fixes are stamped late by this; each on the keyframe nearest in time by the alignment."""
+        """(n,) priors if the fixes are stamped late by this; each on the keyframe nearest in time by the alignment."""
         found, rows = self.found, self.rows
         aligned_ns = self.fixes.stamps_ns[rows] - round(found.offset_s * 1e9)
         after = np.searchsorted(self.stamps_ns, aligned_ns).clip(max=len(self.stamps_ns) - 1)
         before = np.maximum(after - 1, 0)
         nearer = np.abs(self.stamps_ns[before] - aligned_ns) <= np.abs(self.stamps_ns[after] - aligned_ns)
-        nearest = np.where(nearer, before, after)  # the same for every offset: a jump between two has no slope
+        nearest = np.where(nearer, before, after)  # the same for every offset, so that the cost has no jumps
         stamps_ns = self.fixes.stamps_ns[rows] - round(offset_s * 1e9)
         then = self.path.poses(np.asarray((stamps_ns - self.path.start_ns) * 1e-9, np.float64))
         arms = (lie.inverse(self.keyframes[nearest]) @ then @ np.array([*found.lever_arm, 1.0]))[:, :3]
@@ -131,7 +132,7 @@ class _Problem:
 
     @property
     def rows(self) -> I64:
-        """(n,) of the fixes."""
+        """(n,) indices of the fixes."""
         return np.array([int(name) - 1 for name in self.found.names])
 
     def solved(self, offset_s: float, start: F64, which: Mask, *, robust: bool = False) -> F64:
@@ -143,8 +144,8 @@ class _Problem:
     def offset(self, offset_s: float, start: F64, which: Mask) -> tuple[float, float]:
         """The clocks' offset with which graph and fixes agree best, and its standard deviation, s.
 
-        The map bends for each offset that is tried. So drift, which looks like an offset to an alignment, does not
-        when it is in the graph.
+        The map bends for each offset that is tried. So drift, which an alignment would take for an offset, is absorbed
+        by the graph.
         """
         from scipy import optimize  # the page's engine imports this module, and few maps are bent
 
@@ -152,7 +153,7 @@ class _Problem:
         find_root: Any = optimize.root_scalar
 
         def slope(late: float) -> float:
-            """Of half the sum of squares at its optimum over all poses: poses need not be differentiated."""
+            """Slope of half the sum of squares, minimised over all poses, whose derivatives then do not matter."""
             poses, priors = self.solved(late, start, which), self.priors(late)
             off, _ = _off(priors, poses)
             (ahead, _), (behind, _) = (_off(self.priors(late + side), poses) for side in (STEP_S / 4, -STEP_S / 4))
@@ -168,7 +169,7 @@ class _Problem:
         return float(end.root), bend**-0.5
 
     def scaled(self, factor: float) -> "_Problem":
-        """With all covariances of the graph times a factor."""
+        """The same problem with all covariances of the graph multiplied by a factor."""
         return replace(self, graph=[replace(one, covariance=one.covariance * factor) for one in self.graph])
 
     def stiffness(self, which: Mask) -> float:

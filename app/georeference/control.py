@@ -20,7 +20,7 @@ CONTROL = ("name", "east", "north", "height", "latitude", "longitude")
 PICKS = ("name", "x", "y", "z")
 """Columns of the two tables."""
 LEAST_WIDTH = 0.02
-"""Of control points beside the line through them, as a share of their length along it."""
+"""Least spread of control points beside the line through them, as a share of their spread along it."""
 
 
 def control_table(text: str) -> NamedColumns:
@@ -36,14 +36,14 @@ def align_with_points(
     height: str = ELLIPSOIDAL,
     overridden: Mapping[str, bool] = MappingProxyType({}),
 ) -> Alignment:
-    """Where a map lies, by least squares over control points, rotated about all axes. Its shape does not change.
+    """Align a map by least squares over control points, with rotations about all axes. Its shape does not change.
 
     Args:
         control: name, E, N, H in `grid`, or name, latitude, longitude, height. picked: (3,) m in the map, by name.
         height: what heights are above. overridden: False for points that do not count.
 
     Raises:
-        HemislamError: a table cannot be used, or the points leave the map's place open.
+        HemislamError: a table cannot be used, or the points do not determine the map's place.
     """
     name, places = read_places(control, grid)
     names = [one for one in places if one in picked]
@@ -137,7 +137,7 @@ def _coordinates(table: NamedColumns) -> tuple[str, str, str]:
 
 
 def _names(table: NamedColumns) -> list[str]:
-    """Of the control points. Raises HemislamError: one is empty or there twice."""
+    """The names of the control points. Raises HemislamError: a name is empty or occurs twice."""
     names = list(table.columns["name"])
     if "" in names:
         raise HemislamError(f"{table.source}, row {names.index('') + 1}: the name is missing; give the point one.")
@@ -149,7 +149,7 @@ def _names(table: NamedColumns) -> list[str]:
 
 
 def _refuse_line(points: F64, names: list[str]) -> None:
-    """Raises HemislamError if the points lie on one line, about which the map may still turn."""
+    """Raises HemislamError if the points lie on one line, about which the map could still rotate."""
     along, beside, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if beside <= LEAST_WIDTH * along:
         raise HemislamError(
@@ -159,7 +159,7 @@ def _refuse_line(points: F64, names: list[str]) -> None:
 
 
 def _fitted(points: F64, ground: Ground, names: tuple[str, ...], used: Mask, height: str) -> Alignment:
-    """The rigid transform with the least squares of distances."""
+    """The alignment by the rigid transform with the least squared distances."""
     T = umeyama(points[used], ground.places[used])
     R, shift = T[:3, :3], T[:3, 3]
     residuals = ground.places - points @ R.T - shift

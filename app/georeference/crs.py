@@ -20,7 +20,7 @@ def projected(name: str) -> "pyproj.CRS":
     """A coordinate system by "EPSG:code" or WKT.
 
     Raises:
-        HemislamError: there is none, or it is no plane grid of eastings and northings in metres, or has heights.
+        HemislamError: it does not exist, is not a plane grid of eastings and northings in metres, or has heights.
     """
     crs = _system(name, "give one as EPSG:32632")
     if crs.is_compound:
@@ -49,7 +49,7 @@ def vertical(height: str) -> "pyproj.CRS | None":
     """The system of heights named "EPSG:code"; None if they are named in other words.
 
     Raises:
-        HemislamError: there is none, or it is not one of heights upwards in metres.
+        HemislamError: it does not exist, or is not a system of upward heights in metres.
     """
     if not height.upper().startswith("EPSG:"):
         return None
@@ -61,7 +61,7 @@ def vertical(height: str) -> "pyproj.CRS | None":
 
 
 def _system(name: str, advice: str) -> "pyproj.CRS":
-    """Raises HemislamError: there is none of this name; `advice` says what to give."""
+    """Raises HemislamError: no system has this name; `advice` says what to give."""
     import pyproj
 
     try:

@@ -1,7 +1,7 @@
-"""What slow drift does to what fixes determine: it is the same in fixes that follow one another.
+"""The effect of slow drift on values estimated from fixes: consecutive fixes share the same drift.
 
-Drift of the map, and of the receiver, is taken for a random walk. Its rate is what the means of the residuals over
-stretches differ from one to the next beyond their noise.
+Drift of the map, and of the receiver, is modelled as a random walk. Its rate follows from the differences between the
+mean residuals of successive stretches, beyond their noise.
 """
 
 from typing import Final
@@ -13,11 +13,11 @@ from app.slam.arrays import F64
 
 _STRETCH_S: Final = 8.0
 _FEWEST: Final = 3
-"""Fixes of a stretch."""
+"""Least number of fixes of a stretch."""
 _LEAST_RATE: Final = 1e-3**2
-"""m²/s. Assumed at least for what is constant: drift by millimetres hardly shows in fixes of centimetres, and one
-millimetre along the walk looks like a clock offset of one millisecond. Maps by a clean sensor outdoors drift by a
-quarter of it, others by up to 3 mm/√s, which shows."""
+"""m²/s: least rate assumed when constants are estimated. Drift by millimetres hardly shows in fixes of centimetres, but
+one millimetre along the walk looks like a clock offset of one millisecond. Maps by a clean sensor outdoors drift by a
+quarter of this, others by up to 3 mm/√s, which does show."""
 
 
 def constants_despite_drift(
@@ -27,8 +27,8 @@ def constants_despite_drift(
 
     Args:
         residuals: (n, 3) m, at these seconds (n,), ascending. J: (n, 3, k) their change with the constants.
-        sigmas: (n, 3) m, noise of the fixes; if they differ more from one to the next, the noise is that.
-        values: (k,) of the constants so far. expected: (k,) how far from zero they may be, inf if anywhere.
+        sigmas: (n, 3) m, noise of the fixes; if consecutive fixes differ by more, that is taken as the noise.
+        values: (k,) of the constants so far. expected: (k,) how far from zero they may be; inf if unlimited.
 
     Returns:
         (k,) change of the constants, and its covariance (k, k).
@@ -49,12 +49,12 @@ def constants_despite_drift(
 
 
 def drift_deviations(residuals: F64, influence: F64, seconds: F64) -> F64:
-    """(k,) standard deviations of unknowns by the drift that residuals show.
+    """(k,) standard deviations of unknowns due to the drift that residuals show.
 
     Args:
         residuals: (n, 3) m, at these seconds (n,), ascending. influence: (n, 3, k) change of the unknowns per metre.
     """
-    later = influence[::-1].cumsum(axis=0)[::-1][1:]  # a step of the walk moves all that comes later
+    later = influence[::-1].cumsum(axis=0)[::-1][1:]  # a step of the random walk moves all later fixes
     per_rate = np.einsum("nak,n->k", later**2, np.diff(seconds))
     return np.asarray(np.sqrt(_rate(residuals, seconds) * per_rate))
 

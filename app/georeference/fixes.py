@@ -25,7 +25,7 @@ class Fixes(Samples):
 
     @classmethod
     def of(cls, stamps_ns: object, places: object, sigmas: object = None) -> "Fixes":
-        """From (k,) stamps, (k, 3) latitude, longitude, height, and (k, 3) sigmas, if any."""
+        """From (k,) stamps, (k, 3) latitude, longitude, height, and (k, 3) sigmas, if known."""
         stamps, table = np.asarray(stamps_ns, np.int64), np.asarray(places, np.float64).reshape(-1, 3)
         known = np.full(table.shape, np.nan) if sigmas is None else np.asarray(sigmas, np.float64).reshape(-1, 3)
         latitude, longitude, height = np.ascontiguousarray(table.T)
@@ -42,7 +42,7 @@ class Fixes(Samples):
         A sigma that is not greater than zero is unknown.
 
         Raises:
-            HemislamError: naming `source`: fewer than three fixes, or no place on Earth.
+            HemislamError: naming `source`: fewer than three fixes, or a place that is not on Earth.
         """
         there = np.isfinite(self.latitude + self.longitude + self.height) & (
             (self.latitude != 0) | (self.longitude != 0)

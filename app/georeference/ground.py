@@ -1,4 +1,4 @@
-"""Metres on the ground around a place, where a grid's own metres are stretched and its numbers are large."""
+"""True metres on the ground around a place; those of a grid are stretched, and its numbers are large."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +13,7 @@ from app.slam.errors import HemislamError
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Places in true metres on the ground, counted from a point near them.
+    """Places in true metres on the ground, relative to a point near them.
 
     Attributes:
         grid: (n, 3) easting, northing, height, m. places: (n, 3) m east, north, up of the centre.
@@ -26,7 +26,7 @@ class Ground:
 
     @classmethod
     def of(cls, fixes: Fixes, name: str = "") -> "Ground":
-        """Raises HemislamError: the grid is not made for the place, or is none."""
+        """Raises HemislamError: the grid does not exist, or is not made for the place."""
         middle = [float(np.median(column)) for column in (fixes.latitude, fixes.longitude, fixes.height)]
         name = name or crs.utm(middle[0], middle[1])
         crs.check_place(name, middle[0], middle[1])
@@ -35,7 +35,7 @@ class Ground:
 
     @classmethod
     def in_grid(cls, grid: F64, name: str) -> "Ground":
-        """Of (n, 3) easting, northing and height. Raises HemislamError: the grid is not made for the place."""
+        """From (n, 3) easting, northing and height. Raises HemislamError: the grid is not made for the place."""
         east, north, up = np.round(np.median(grid, axis=0)).tolist()
         try:
             latitude, longitude = crs.place(name, east, north)
@@ -51,7 +51,7 @@ class Ground:
         return cls(grid, level.from_crs(grid), level)
 
     def reference(self, R_ground_map: F64, shift: F64, height: str) -> GeoReference:
-        """Where a map lies whose origin is at `shift` (3,) m from the centre."""
+        """The georeference of a map whose origin is at `shift` (3,) m from the centre."""
         (origin,), rows = self.centre.to_crs(shift).tolist(), map(tuple, R_ground_map.tolist())
         return replace(self.centre, origin=tuple(origin), rotation=tuple(rows), height=height)  # type: ignore[arg-type]
 

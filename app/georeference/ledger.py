@@ -11,14 +11,14 @@ if TYPE_CHECKING:  # every run imports this module, and few need the solver
     from app.georeference.align import Alignment
 
 SURE_OFFSET_S = 1e-3
-"""Of a less certain offset, a user is told how to determine it better. On foot, 1 ms is about 1 mm."""
+"""If the offset is less certain than this, the user is told how to determine it better. On foot, 1 ms is about 1 mm."""
 COLUMNS = (
     "name", "east_m", "north_m", "height_m", "d_east_m", "d_north_m", "d_height_m", "sigmas", "verdict",
 )  # fmt: skip
 
 
 def residuals_csv(alignment: "Alignment") -> str:
-    """One line a fix: its place in the grid, measured minus map, and whether it counts."""
+    """One line per fix: its place in the grid, measured minus map, and whether it counts."""
     rows = []
     for name, place, off, sigmas, used in _rows(alignment):
         cells = [f"{value:.4f}" for value in (*place, *off)] + [f"{sigmas:.2f}" if np.isfinite(sigmas) else ""]
@@ -27,12 +27,12 @@ def residuals_csv(alignment: "Alignment") -> str:
 
 
 def files(alignment: "Alignment") -> dict[str, str]:
-    """What is written beside the results: texts by name of the file."""
+    """The files beside the results: texts by file name."""
     return {reference.FILE: alignment.reference.to_json(), reference.RESIDUALS: residuals_csv(alignment)}
 
 
 def report(alignment: "Alignment") -> dict[str, Any]:
-    """What report.json says of it."""
+    """The alignment's part of report.json."""
     rms = dict(zip(("east_m", "north_m", "height_m"), alignment.rms.tolist(), strict=True))
     counts = {"used": int(alignment.used.sum()), "of": len(alignment.used)}
     return {"crs": alignment.reference.crs, "height": alignment.reference.height, "rms": rms, **counts}
@@ -44,7 +44,7 @@ def summary(alignment: "Alignment", what: str) -> list[str]:
 
 
 def in_rows(alignment: "Alignment", what: str) -> list[tuple[str, str]]:
-    """As `summary`, names and texts apart."""
+    """As `summary`, with names and texts separate."""
     where, used = alignment.reference, int(alignment.used.sum())
     east, north, height = where.origin
     bearing = float(np.degrees(np.arctan2(where.rotation[0][0], where.rotation[1][0])) % 360.0)

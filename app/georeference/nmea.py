@@ -13,27 +13,27 @@ from app.slam.errors import HemislamError
 
 _DAY_S = 86_400.0
 _YEARS = range(1980, 2200)
-"""Since GPS time began, and as far as stamps in ns go."""
+"""Valid years: since GPS time began, and as far as stamps in ns reach."""
 _PAUSE_NS = 60_000_000_000
-"""After a longer one, the day may be another one."""
+"""After a longer pause, the day may be another one."""
 _NOBODY = (float("nan"),) * 3
 
 
 @dataclass(slots=True)
 class _Log:
-    """What the sentences of a receiver say, in its order.
+    """The content of a receiver's sentences, in their order.
 
     Attributes:
         walk_ns: the time of the walk: of two dates that contradict each other without a pause, the nearer one counts.
-        near_ns: a time within half a day, for sentences without a date; at first that of the walk.
-        places: latitude and longitude in degrees, height above the geoid and the geoid's above the ellipsoid (nan if
-            not told), m. stamps: of each place, in ns.
+        near_ns: a time within half a day, for sentences without a date; at first the time of the walk.
+        places: latitude and longitude in degrees, height above the geoid, and the geoid's height above the ellipsoid
+            (nan if not stated), m. stamps: of each place, in ns.
         sigmas: of each place, m to the east, north and up. told: those of the day's GST, by s of the day.
         untold: by s of the day, the places without sigmas so far. now: s of the day; if it steps back, a day begins.
-        fixed: the last GGA or RMC has a fix; None before the first. Without one, the date of ZDA may be that of the
-            receiver's own clock.
-        early: day and s of it, by the last ZDA before the first GGA or RMC, which says whether it counts.
-        begin: the first place after the last pause. dated: a sentence has said its day.
+        fixed: whether the last GGA or RMC has a fix; None before the first. Without a fix, the date of ZDA may be that
+            of the receiver's own clock.
+        early: day, and s of the day, by the last ZDA before the first GGA or RMC, which decides whether it counts.
+        begin: the first place after the last pause. dated: whether a sentence has stated its day.
     """
 
     walk_ns: int
@@ -50,7 +50,7 @@ class _Log:
     dated: bool = False
 
     def add(self, line: str) -> None:
-        """One line; anything but a whole sentence with the right checksum is ignored."""
+        """Add one line; anything but a complete sentence with the right checksum is ignored."""
         body, star, checksum = line.strip().rpartition("$")[2].partition("*")
         if not star or checksum[:2].upper() != f"{reduce(xor, body.encode(), 0):02X}":
             return
@@ -95,7 +95,7 @@ class _Log:
             self.untold[at] = len(self.sigmas) - 1
 
     def _at(self, text: str) -> float:
-        """The s of the day of a place or its sigmas."""
+        """s of the day, of a place or its sigmas."""
         before, self.now = self.now, _seconds(text)
         if self.now < before - _PAUSE_NS / 1e9:
             self.told.clear()
@@ -133,7 +133,7 @@ def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
     if not log.places:
         raise HemislamError(f"{source} holds no NMEA sentence GGA with a position; switch it on in the receiver.")
     *place, height, separation = np.array(log.places).T
-    ellipsoidal = bool(np.isfinite(separation).all())  # if it is missing once, all heights are left above the geoid
+    ellipsoidal = bool(np.isfinite(separation).all())  # if it is missing once, all heights stay above the geoid
     places = np.column_stack([*place, height + separation if ellipsoidal else height])
     return Fixes.of(log.stamps, places, log.sigmas), ellipsoidal
 

@@ -1,4 +1,4 @@
-"""The path of the IMU, and of an antenna on it, at any time between the poses of a trajectory; where it fits places."""
+"""The path of the IMU, and of an antenna on it, at any time between the poses of a trajectory; its fit to places."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -10,7 +10,7 @@ from app.slam.trajectory import Trajectory
 SEARCH_S = 10.0
 """Fixes may be stamped this much too early or too late."""
 GAP_S = 1.0
-"""Between poses farther apart than this, the place of the antenna is not known."""
+"""Between poses farther apart in time than this, the place of the antenna is unknown."""
 
 
 class PathOverTime:
@@ -48,7 +48,7 @@ class PathOverTime:
         return np.asarray(places + turns.apply(lever))
 
     def _at(self, t: F64) -> tuple[F64, Rotation]:
-        """Places (n, 3) and attitudes. Kept until other times are asked for: most steps of a fit ask for the same."""
+        """Places (n, 3) and attitudes. The last result is kept: most steps of a fit ask for the same times."""
         asked = self._asked
         if asked is None or not np.array_equal(asked[0], t):
             inside = np.clip(t, self._times[0], self._times[-1])
@@ -59,7 +59,7 @@ class PathOverTime:
 def aligned_robustly(points: F64, places: F64) -> tuple[float, F64, F64]:
     """The yaw (rad) and shift (3,) that move points (n, 3) onto places with the smallest sum of distances.
 
-    Returns also how far each is off, m (n,). By reweighted least squares (Weiszfeld), so that a few wrong ones do not
+    Returns also the distance of each, m (n,). By reweighted least squares (Weiszfeld), so a few wrong places do not
     matter.
     """
     weights = np.ones(len(points))

@@ -12,7 +12,7 @@ from app.slam.arrays import F64, Vector
 from app.slam.errors import HemislamError
 
 FILE, RESIDUALS, PLOT = "georeference.json", "gnss_residuals.csv", "georeference.svg"
-"""Beside the results: itself, the fixes that it is made from, and a drawing of both."""
+"""Files beside the results: the georeference, the fixes that it is made from, and a drawing of both."""
 ELLIPSOIDAL = crs.ELLIPSOIDAL
 
 
@@ -28,7 +28,7 @@ class GeoReference:
         height: what heights are above: "ellipsoidal", "EPSG:code" of a system of heights, or other words.
 
     Raises:
-        HemislamError: the code is not one of heights.
+        HemislamError: the code is not that of a system of heights.
     """
 
     crs: str
@@ -62,7 +62,7 @@ class GeoReference:
 
     @property
     def raster_crs(self) -> str:
-        """The same for a GeoTIFF, by code or text: GDAL writes no grid with heights above the ellipsoid into one."""
+        """The same for a GeoTIFF, as code or text: GDAL cannot write a grid with heights above the ellipsoid there."""
         return crs.projected(self.crs).to_wkt() if self.height == ELLIPSOIDAL else self.wkt1()
 
     @property
@@ -101,7 +101,7 @@ _ADAPTER = TypeAdapter(GeoReference)
 
 
 def read(folder: Path) -> tuple[GeoReference | None, str]:
-    """That of the results in a folder, if there is one that can be used; else why it is not used, "" without any."""
+    """The georeference of the results in a folder; else None, and why the one there is not used ("" if none is)."""
     try:
         return GeoReference.from_json((folder / FILE).read_bytes()), ""
     except FileNotFoundError:

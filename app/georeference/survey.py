@@ -1,4 +1,4 @@
-"""What a map is georeferenced by, as a session stores it."""
+"""The fixes or control points that georeference a map, as a session stores them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +10,10 @@ from app.slam.arrays import Vector
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """Where a control point is on what a keyframe saw, so that it moves with the map.
+    """The place of a control point relative to a keyframe, so that it moves with the map.
 
     Attributes:
-        at: m, in the keyframe's IMU frame. frame: of the keyframe, since other settings make others; -1: not known.
+        at: m, in the keyframe's IMU frame. frame: of the keyframe, since other settings choose others; -1: unknown.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Survey:
         picks: where these are in the map. crs: "EPSG:code" of a projected system; "": the UTM zone there.
         height: what heights are above; "": as the fixes say. lever: m from the IMU to the antenna, IMU frame; None:
             estimated, if the motion allows. offset_s: how much later fixes are stamped than measured; None: estimated.
-        factors: the fixes bend the map.
+        factors: whether the fixes bend the map.
     """
 
     gnss: Path | None = None

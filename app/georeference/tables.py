@@ -18,10 +18,10 @@ from app.slam.user_text import read_text
 
 GEOID = "orthometric (geoid of the receiver)"
 GPS_MINUS_UNIX_S = 18 - 315_964_800
-"""From Unix to GPS time: the leap seconds since 2017, and when the first GPS week began."""
+"""To convert Unix to GPS time: the leap seconds since 2017, and the start of the first GPS week."""
 WEEK_S = 604_800
 MOST_S = 4e9
-"""More seconds are milliseconds."""
+"""Larger numbers are milliseconds, not seconds."""
 
 _NAMES = {
     "time": ("time", "t", "stamp", "timestamp", "unix", "utc", "time_s", "stamp_s"),
@@ -39,12 +39,12 @@ _NAMES = {
     "y": ("y", "y_m"),
     "z": ("z", "z_m"),
 }
-"""What a column is, by its heading in small letters without units in brackets."""
+"""The kinds of columns, with their headings in small letters without units in brackets."""
 
 
 @dataclass(frozen=True, slots=True)
 class NamedColumns:
-    """A table that was read. columns: (n,) texts by what they are; only those that have a name above."""
+    """A table that was read. columns: (n,) texts by kind; other columns are left out."""
 
     source: str
     columns: Mapping[str, Sequence[str]]
@@ -56,7 +56,7 @@ class NamedColumns:
         return all(name in self.columns for name in wanted)
 
     def numbers(self, *wanted: str) -> F64:
-        """(n, k) of these columns; an empty cell is nan. Raises HemislamError: there is a word that is no number."""
+        """(n, k) numbers of these columns; an empty cell is nan. Raises HemislamError: a word is not a number."""
         out = np.full((len(self), len(wanted)), np.nan)
         for at, name in enumerate(wanted):
             for row, word in enumerate(self.columns[name]):
@@ -70,7 +70,7 @@ class NamedColumns:
 
 
 def read_table(path: Path, *wanted: str) -> NamedColumns:
-    """As `table_of`, of a file. Raises HemislamError as well if it cannot be read."""
+    """As `table_of`, from a file. Raises HemislamError also if the file cannot be read."""
     return table_of(read_text(path, "save it as CSV").splitlines(), str(path), *wanted)
 
 
@@ -78,10 +78,10 @@ def table_of(lines: Sequence[str], source: str, *wanted: str) -> NamedColumns:
     """A table with a heading, separated by commas, semicolons or spaces; `#` begins a comment.
 
     Args:
-        source: as errors name it. wanted: what columns are asked for, where a heading may mean several things.
+        source: name in error messages. wanted: the columns needed, in case a heading may mean several things.
 
     Raises:
-        HemislamError: it has no heading, a quotation mark is not closed, or a row is cut.
+        HemislamError: the table has no heading, a quotation mark is not closed, or a row is incomplete.
     """
     rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
@@ -118,11 +118,11 @@ def read_fixes(path: Path, near_ns: int) -> tuple[Fixes, str]:
         The fixes, and what their heights are above.
 
     Raises:
-        HemislamError: it cannot be read, or is none of these.
+        HemislamError: the file cannot be read, or is none of these.
     """
     text = read_text(path, "give NMEA or CSV", errors="replace")  # a log may hold binary messages beside the sentences
     lines = text.splitlines()
-    if any(re.search(r"\$G\w{4},", line) for line in lines[:50]):  # loggers write times before it
+    if any(re.search(r"\$G\w{4},", line) for line in lines[:50]):  # loggers may put times before a sentence
         fixes, ellipsoidal = nmea.read(lines, str(path), near_ns)
         return fixes.sound(str(path)), ELLIPSOIDAL if ellipsoidal else GEOID
     table = read_table(path, "time", "latitude", "longitude", "height")
@@ -154,7 +154,7 @@ def _stamp(table: NamedColumns, word: str) -> int:
 
 
 def _nanoseconds(word: str) -> int:
-    """Raises ValueError or ArithmeticError: it is no time, or none within 292 years of 1970."""
+    """Raises ValueError or ArithmeticError: it is not a time, or not within 292 years of 1970."""
     try:
         return int(np.int64(int(Decimal(word).scaleb(9).to_integral_value())))
     except InvalidOperation:
