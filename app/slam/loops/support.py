@@ -83,9 +83,10 @@ def settle(
                 edge, verdict=Verdict.ACCEPTED, reason=reason, evidence=evidence, decided_at=now, weight=1.0
             )
         elif edge.pair in out:
-            waits = f"{evidence.summary}; {support} of {needed} others agree"
+            agreement = f"{support} others agree ({needed} needed)"
+            waits = f"{evidence.summary}; {agreement}"
             if alone:
-                waits = f"{edge.evidence.against_odometry(params.max_mahalanobis)}; {support} of {needed} others agree"
+                waits = f"{edge.evidence.against_odometry(params.max_mahalanobis)}; {agreement}"
                 waits += f" over {stretch:.0f} m (least {STRETCH_M:g} m)"
             if rivals:
                 waits += f"; {rivals} that odometry finds likelier lead to another place"

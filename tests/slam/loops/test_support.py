@@ -238,7 +238,7 @@ def judged(loops: list[LoopEdge], evidence: Evidence = SLIPPED, *others: LoopEdg
 def test_one_loop_against_odometry_stays_undecided_and_says_so() -> None:
     (edge,) = judged([loop(40)]).values()
     assert edge.verdict is Verdict.CANDIDATE
-    assert "odometry rules it out: 9.0 σ" in edge.reason and "0 of 4 others agree" in edge.reason
+    assert "odometry rules it out: 9.0 σ" in edge.reason and "0 others agree (4 needed)" in edge.reason
 
 
 def test_loops_that_agree_over_a_stretch_outvote_odometry() -> None:
