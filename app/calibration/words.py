@@ -98,7 +98,7 @@ def write_beside(recording: Path, found: Mapping[str, Any]) -> Path:
         HemislamError: nothing was found; or the file cannot be written, and then the older one stays.
     """
     if not found:
-        raise HemislamError(f"Nothing that was found in {recording} can be kept: {WALK}.")
+        raise HemislamError(f"Nothing found in {recording} can be kept: {WALK}.")
     path = sidecar(recording)
     texts = {path.name: f"{CALIBRATED}; delete this file to undo it.\n{_yaml(nested(found))}"}
     if (mine := uncalibrated(recording)) is not None:

@@ -101,7 +101,7 @@ def align(
         HemislamError: fixes do not fit the trajectory in time or place, or leave the heading open; `lever` not finite.
     """
     if lever is not None and not np.isfinite(lever).all():
-        raise HemislamError(f"A lever arm of {lever} is none; give three numbers of metres.")
+        raise HemislamError(f"The lever arm cannot be {lever}; give three numbers in metres.")
     if len(trajectory) < 4:
         raise HemislamError("The trajectory has fewer than 4 poses; that is too few to align it with fixes.")
     path = PathOverTime(trajectory)

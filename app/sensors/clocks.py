@@ -27,9 +27,9 @@ def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
     spread = _offset_spread_s(scans, imu)
     if spread > TOLERANCE_S:
         text = (
-            f"the offset between the LiDAR's and the IMU's stamps changes by {spread:.3f} s on the way: a clock "
-            "was set or drifts; map a part before that (start hemislam with --start and --duration), and use one clock "
-            "for both next time"
+            f"the offset between the LiDAR's and the IMU's stamps changes by {spread:.3f} s during "
+            "the recording: a clock was set or drifts; map a part before that (start hemislam with --start and "
+            "--duration), and use one clock for both next time"
         )
         return Finding("clocks", "needs you", text)
     offset = _offset_s(scans, imu)

@@ -62,7 +62,7 @@ def _missing(distances: F64, ring: U16, params: SensorParams) -> list[Finding]:
     ):
         return []
     text = (
-        f"{same.mean():.0%} of the points are exactly {distance:g} m away: so the driver writes missing returns; "
+        f"{same.mean():.0%} of the points are exactly {distance:g} m away: the driver writes this for missing returns; "
         "set the maximum range below that"
     )
     return [Finding("distances", "needs you", text, f"--set sensor.max_range={0.99 * distance:.3g}")]

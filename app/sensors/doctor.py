@@ -180,7 +180,7 @@ def _rate(subject: str, stamps: I64, least: float) -> Finding:
     spread = (np.percentile(steps, 99) - np.percentile(steps, 1)) / 1e6
     text = f"{rate:.2f} Hz, {len(stamps)} messages; 98 % of the intervals within {spread:.2f} ms"
     if rate < least:
-        text += f"; that is little: mapping by hand needs {least:g} Hz or more"
+        text += f"; this is too slow: handheld mapping needs {least:g} Hz or more"
     return Finding(subject, "fine" if rate >= least else "needs you", text)
 
 
@@ -214,7 +214,7 @@ def _imu_gaps(counts: Counts, limit_s: float, pauses: int) -> Finding:
     longest = counts.longest_imu_gap_s
     text = (
         f"{counts.imu_gaps} longer than {limit_s:g} s, the longest {longest:.3f} s; "
-        "there only the scans show the motion: check the IMU's cable and driver"
+        "in these gaps, only the scans show the motion: check the IMU's cable and driver"
     )
     return Finding("IMU gaps", "needs you", text)
 

@@ -97,7 +97,7 @@ def settle_imu(probe: ImuProbe, chosen: RecordingParams) -> tuple[ImuUnits, list
     norm = float(np.median(np.linalg.norm(probe.accel, axis=1)))
     if norm == 0.0:
         raise HemislamError(
-            "The accelerometer reads 0 on all axes, which none does on Earth; check the IMU's driver, or start "
+            "The accelerometer reads 0 on all axes, which is impossible on Earth; check the IMU's driver, or start "
             "hemislam with --imu-topic and another topic."
         )
     accel_unit, findings = _acceleration_unit(norm, chosen.acceleration_unit)
@@ -145,7 +145,7 @@ def _acceleration_unit(norm: float, chosen: str) -> tuple[float, list[Finding]]:
     if fitting is not None:
         text = f"{fitting}: {text}; scaled to m/s²"
         return ACCELERATION_UNITS[fitting], [Finding("IMU units", "corrected", text, f"{option}m/s2")]
-    text = f"{text}, gravity in none of {', '.join(ACCELERATION_UNITS)}"
+    text = f"{text}, which is not gravity in any of {', '.join(ACCELERATION_UNITS)}"
     for unit, scale in ACCELERATION_UNITS.items():
         if 6.5 < norm * scale < 15.0:  # a recording that begins amid walking may show so little or so much
             return scale, [Finding("IMU units", "needs you", f"{text}; taken as {unit}: check the IMU's driver")]

@@ -67,7 +67,7 @@ def choose_topic(source: Source, sensor: Literal["lidar", "imu"], wanted: str) -
     rest = ", ".join(topic.name for topic in candidates if topic is not chosen)
     if sum(content == fullest for content in content_of.values()) == 1:
         what = "times or rings" if sensor == "lidar" else "both accelerations and rates"
-        text = f"{chosen.name}, {chosen.messages} messages, the one with the most of {what}; there are also {rest}"
+        text = f"{chosen.name}, {chosen.messages} messages, chosen because it holds {what}; there are also {rest}"
         return chosen, Finding(subject, "corrected", text, option + rest.split(", ")[0])
     text = f"{chosen.name} has the most messages ({chosen.messages}); there are also {rest}"
     return chosen, Finding(subject, "needs you", text, option + chosen.name)

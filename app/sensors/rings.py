@@ -105,7 +105,7 @@ def line_findings(scans: list[Scan], has_lines: bool, params: SensorParams) -> l
         given = len(getattr(params, name).split())
         if given and not lines <= given <= _all_lines(lines):
             there = f"the LiDAR has {lines} scan lines" if has_lines else "the LiDAR has no scan lines"
-            text = f"`sensor.{name}` holds {given} numbers, but {there}; take those of this LiDAR, or none"
+            text = f"`sensor.{name}` holds {given} numbers, but {there}; use the corrections of this LiDAR, or none"
             found.append(Finding("scan lines", "needs you", text, f'--set sensor.{name}=""'))
     return found
 

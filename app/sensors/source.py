@@ -161,7 +161,7 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
     if (unindexed or reader.may_be_disordered()) and (in_order := _in_file_order(path, files, always=unindexed)):
         reader.close()
         wrong = "it has no index of its messages" if unindexed else "log times in it are wrong"
-        why = "the recorder's clock was set back on the way" if in_order.set_back else wrong
+        why = "the recorder's clock was set back while recording" if in_order.set_back else wrong
         return in_order, (*found, Finding("file", "corrected", f"read in the order of the file, since {why}"))
     if unmerged := [wal for file in files for wal in _write_ahead_logs(file)]:
         database = str(unmerged[0]).removesuffix("-wal")
@@ -182,7 +182,7 @@ def _read_by_rosbags(path: Path, files: list[Path]) -> tuple[RosbagsStream, tupl
     """The files as a stream; a wrong metadata.yaml of a folder is ignored. Raises whatever the library raises."""
     stream: RosbagsStream | Exception
     try:
-        stream, why = RosbagsStream(files), "it tells of other messages than the files hold"
+        stream, why = RosbagsStream(files), "it states other messages than the files hold"
         if not stream.is_contradicted():
             return stream, ()
     except Exception as error:

@@ -147,7 +147,7 @@ def _settle_reference(
         elif header == "last" and after:
             shift = -max(most)
         timing = Timing(name, unit_ns, "header", shift, period_ns)
-        text = f"`{name}` counts from the header stamp (it stays below a scan)"
+        text = f"`{name}` counts from the header stamp (it stays below the duration of a scan)"
         return timing, [Finding("time reference", "fine", text), stamp_finding]
     away = min((to_first, to_last), key=abs) / 1e9
     text = (
@@ -200,13 +200,13 @@ def _header_by_delay(clouds: list[Probe], duration_ns: float) -> tuple[End, Find
     """The header's point, judged by how long after it the clouds were logged; without evidence, the last."""
     delay = log_delay_ns(clouds)
     if delay is None:
-        return _header("last", "the recording does not show it; most drivers do so; if not:", "needs you")
+        return _header("last", "the recording does not show which; most drivers take the last; if not:", "needs you")
     text = f"the clouds were logged {delay / 1e6:.0f} ms after it, and a scan takes {duration_ns / 1e6:.0f} ms"
     if delay < 0.5 * duration_ns:
         return _header("last", text, "corrected")
     if 0.9 * duration_ns < delay < 3 * duration_ns:
         return _header("first", text, "corrected")
-    return _header("last", f"{text}, which shows neither; most drivers do so; if not:", "needs you")
+    return _header("last", f"{text}, which does not decide it; most drivers take the last; if not:", "needs you")
 
 
 def _header(end: End, evidence: str, verdict: FindingVerdict) -> tuple[End, Finding]:

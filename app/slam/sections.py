@@ -58,7 +58,7 @@ class Section(BaseModel):
         parts = value if isinstance(value, list | tuple) else (value,)
         is_switch = isinstance(cls.model_fields[str(info.field_name)].default, bool)
         if not is_switch and any(isinstance(part, bool) for part in parts):
-            raise ValueError("true and false are no numbers")
+            raise ValueError("true and false are not numbers")
         return value
 
     @classmethod
@@ -71,9 +71,9 @@ class RecordingParams(Section):
     """How a recording is read. `auto` lets the doctor decide and report its choice."""
 
     lidar_topic: str = _on_restart(
-        "", "Topic of the point clouds. Empty: that with times and rings, or else with the most messages."
+        "", "Topic of the point clouds. Empty: the one with times and rings, else the one with the most messages."
     )
-    imu_topic: str = _on_restart("", "Topic of the IMU. Empty: the whole IMU with the most messages.")
+    imu_topic: str = _on_restart("", "Topic of the IMU. Empty: the complete IMU with the most messages.")
     time_field: str = _on_restart("auto", "Name of the per-point time field. `none` derives the time from the azimuth.")
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = _on_restart("auto", "Unit of the per-point time.")
     time_reference: Literal["auto", "absolute", "relative"] = _on_restart(
@@ -258,7 +258,7 @@ class LoopsParams(Section):
     candidates: int = _next_frame(
         10, "Nearest places by ring key whose Scan Contexts are compared.", (1, 100, 1), symbol="M"
     )
-    verified: int = _next_frame(2, "Best of these that are registered, for each keyframe.", (1, 10, 1))
+    verified: int = _next_frame(2, "Number of the best of these registered for each keyframe.", (1, 10, 1))
     context_distance: float = _next_frame(
         0.3, "Candidates with a larger Scan Context distance are refused without registration.", (0.01, 1, 0.01)
     )
@@ -280,7 +280,7 @@ class LoopsParams(Section):
     )
     max_mahalanobis: float = _next_frame(
         3.5,
-        "Standard deviations from where odometry expects a loop; one farther off must be borne out by several others.",
+        "Standard deviations from where odometry expects a loop; one farther off needs support by several others.",
         (0.5, 20, 0.1),
         "σ",
     )

@@ -56,6 +56,4 @@ def mount_finding(T_imu_lidar: F64) -> Finding:
     place = ", ".join(f"{x:.5f}" for x in T_imu_lidar[:3, 3])
     angles = ", ".join(f"{angle:.2f}" for angle in lie.rpy_degrees(T_imu_lidar[:3, :3]))
     option = f"--set 'sensor.translation=[{place}]' --set 'sensor.rotation=[{angles}]'"
-    return Finding(
-        "unit's mount", "fine", f"the unit says how its LiDAR sits relative to its IMU; to use that: {option}"
-    )
+    return Finding("unit's mount", "fine", f"the unit reports the pose of its LiDAR on its IMU; to use it: {option}")

@@ -81,7 +81,7 @@ def parse_address(text: str) -> Address:
     options = dict(parse_qsl(parts.query))
     if unknown := [name for name in options if name not in kind.options]:
         known = ", ".join(kind.options) or "none"
-        raise HemislamError(f"`{text}`: there is no option `{unknown[0]}`; there are: {known}.")
+        raise HemislamError(f"`{text}`: there is no option `{unknown[0]}`; the options are: {known}.")
     if options.get("clock", "auto") not in ("auto", "sensor", "host"):
         raise HemislamError(f"`{text}`: the clock is `auto`, `sensor` or `host`.")
     return Address(scheme, host, ports, options)
