@@ -107,7 +107,7 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
         truth = _read_file(Path(text))
     if lever is not None:
         if not np.isfinite(lever).all():
-            raise HemislamError(f"A lever arm of {lever} is none; give three numbers of metres.")
+            raise HemislamError(f"The lever arm cannot be {lever}; give three numbers in metres.")
         truth = replace(truth, lever=lever)
     check(truth)
     return truth
