@@ -95,21 +95,17 @@ class TrajectoryNode:
         self._root = root
         self._colour = colour
         self._blocks: list[viser.LineSegmentsHandle] = []
-        self._drawn: list[F32] = []
 
     def draw(self, positions: F64, visible: bool) -> None:
         """Draw (n, 3) positions, sending the blocks that differ from what is drawn."""
         while len(self._blocks) > -(-max(len(positions) - 1, 0) // BLOCK):
             self._blocks.pop().remove()
-            self._drawn.pop()
         for index, first in enumerate(range(0, len(positions) - 1, BLOCK)):
-            part = positions[first : first + BLOCK + 1].astype(np.float32)
+            part = segments(positions[first : first + BLOCK + 1])
             if index == len(self._blocks):
-                self._drawn.append(part)
-                self._blocks.append(add_lines(self._scene, f"{self._root}/{index}", segments(part), self._colour, 3.0))
-            elif len(part) != len(self._drawn[index]) or np.abs(part - self._drawn[index]).max() > STILL_M:
-                self._drawn[index] = part
-                self._blocks[index].points = segments(part)
+                self._blocks.append(add_lines(self._scene, f"{self._root}/{index}", part, self._colour, 3.0))
+            elif len(part) != len(drawn := self._blocks[index].points) or np.abs(part - drawn).max() > STILL_M:
+                self._blocks[index].points = part
             self._blocks[index].visible = visible
 
 

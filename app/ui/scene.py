@@ -11,7 +11,7 @@ import viser
 
 from app.server.protocol import Snapshot
 from app.server.setup import POINT_BUDGET
-from app.slam.types import F64, StepResult
+from app.slam.types import F64
 from app.ui.camera import Framing
 from app.ui.chunks import MapChunks
 from app.ui.colours import chosen_ends
@@ -59,8 +59,8 @@ class Scene:
             shadow_opacity=0.0,
             position=(0.0, 0.0, _GROUND_BEFORE_SEEN_M),
         )
-        self._session, self._light = -1, False
-        self._shown: StepResult | None = None
+        self._session = -1
+        self._seen = False  # a frame of this session
         self._changes = Changes()
         self.chunks = MapChunks(scene, f"{ROOT}/keyframes", budget)
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
@@ -104,25 +104,23 @@ class Scene:
         recording, result = current.recording, current.result
         start_ns = recording.start_ns if recording else 0
         if current.session != self._session:
-            self._session, self._shown, self._framed = current.session, None, 0
+            self._session, self._seen, self._framed = current.session, False, 0
             self.chunks.clear(start_ns, recording.end_s if recording else 1.0)
             self._sensor.clear()
         self._grid.visible = view.grid
-        if view.light != self._light:
-            self._light = view.light
-            self._grid.cell_color, self._grid.section_color = _GRID[view.light]
+        self._grid.cell_color, self._grid.section_color = _GRID[view.light]
         if result is None:
             return
         limits = self.chunks.limits
         if self._changes(result, current.params, view, limits):
             ends = chosen_ends(limits, view.colour_by, view.ends)
-            self._sensor.draw(self._shown, result, current.params, view, ends, start_ns)
+            self._sensor.draw(result, current.params, view, ends, start_ns)
         z = self._sensor.ground_z
         if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it shiver
             self._grid.position = (0.0, 0.0, z)
         if view.follow:
-            self._follow(result.T_map_imu[:3, 3], jump=self._shown is None)
-        self._shown = result
+            self._follow(result.T_map_imu[:3, 3], jump=not self._seen)
+        self._seen = True
 
     def _look(self, current: Snapshot, view: View) -> bool:
         """Keep the map or the sensor in the picture; False while cameras are on their way."""

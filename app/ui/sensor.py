@@ -6,7 +6,6 @@ from typing import Final
 import numpy as np
 import viser
 
-from app.export.box import Box
 from app.slam import lie
 from app.slam.params import Params
 from app.slam.types import F64, GROUND, SEED, StepResult
@@ -47,7 +46,6 @@ class SensorScene:
         self._plane = scene.add_frame(f"{below}/plane", show_axes=False)
         add_surface(scene, f"{below}/plane/disc", vertices, faces, ground, 0.16)
         add_lines(scene, f"{below}/plane/rim", rim, ground, 2.0)
-        self._clip: Box | None = None
         self.clear()
 
     def clear(self) -> None:
@@ -56,37 +54,24 @@ class SensorScene:
         self._height = 1.3
         self.ground_z: float | None = None
 
-    def draw(
-        self,
-        previous: StepResult | None,
-        result: StepResult,
-        params: Params,
-        view: View,
-        limits: Mapping[str, Limits],
-        start_ns: int,
-    ) -> None:
-        """Draw `result`; of a frame that was only labelled again, only colours are sent.
+    def draw(self, result: StepResult, params: Params, view: View, limits: Mapping[str, Limits], start_ns: int) -> None:
+        """Draw `result`. Of a frame that was only labelled again viser sends only colours, since the rest is the same.
 
         Args:
-            previous: what is drawn now. limits: ends of the colour maps by mode.
-            start_ns: of the recording.
+            limits: ends of the colour maps by mode. start_ns: of the recording.
         """
         self._imu.visible = True
         T_map_lidar = result.T_map_lidar
         cloud, shown = result.cloud, np.arange(len(result.cloud))[shown_of(len(result.cloud))]
         if view.clip is not None:
             shown = shown[view.clip.holds(lie.moved(T_map_lidar, cloud.points[shown]))]
-        another = previous is None or previous.index != result.index or previous.stamp_ns != result.stamp_ns
-        cut, self._clip = view.clip != self._clip, view.clip
         if len(shown):  # the page cannot draw a cloud without points: it is hidden instead
             points = PointSet.of(cloud, shown, T_map_lidar, (result.stamp_ns - start_ns) * 1e-9)
             by = LABEL if view.tuning or view.colour_by == LOOK else view.colour_by  # what is tuned stands out
             self._scan.colors = colours(points, by, limits)
-            if another or cut or view.clip is not None:
-                self._scan.points = points.points.astype(np.float16)
-        if another:
-            place(self._imu, result.T_map_imu)
-            place(self._lidar, result.state.T_imu_lidar)
+            self._scan.points = points.points.astype(np.float16)
+        place(self._imu, result.T_map_imu)
+        place(self._lidar, result.state.T_imu_lidar)
         self._scan.point_size = view.point_size * (_TUNED_POINT_SCALE if view.tuning else SCAN_POINT_SCALE)
         self._scan.visible = view.scan and len(shown) > 0
         self._draw_plane(result, T_map_lidar, view)

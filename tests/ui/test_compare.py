@@ -287,7 +287,8 @@ def test_swapped_b_is_drawn_whole_and_a_follows(page: Page) -> None:
     page.draw()
     page.draw()
     assert "A · wide" in page.panel._status.content and "B · main" in page.panel._status.content
-    (path,) = page.workbench._scene._trajectory._drawn
+    (block,) = page.workbench._scene._trajectory._blocks
+    path = np.concatenate((block.points[:1, 0], block.points[:, 1]))
     np.testing.assert_allclose(path, page.forks.snapshot.trajectory, rtol=0, atol=1e-3)
     page.forks.send(StepFrame(1))
     eventually(lambda: page.engine.snapshot.transport.frame == 41)
