@@ -71,17 +71,18 @@ class _Drawn:
     """A keyframe in the scene.
 
     Attributes:
-        limits: ends of the colour maps with this keyframe and those before it. light: (n,) of the chunk's points.
-        part: how many of them may be drawn. shown: (n,) which were sent, `count` of them.
+        T_map_lidar: where it is drawn. light: (n,) of the chunk's points.
+        limits: ends of the colour maps with this keyframe and those before it.
+        part: how many of the points may be drawn. shown: (n,) which were sent.
         handle: None while there are none.
     """
 
     chunk: Chunk
+    T_map_lidar: F64
     limits: dict[str, Limits]
     light: F32
     part: int = 0
     shown: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
-    count: int = 0
     handle: viser.PointCloudHandle | None = None
 
 
@@ -100,7 +101,7 @@ class MapChunks:
         self._drawn: list[_Drawn] = []
         self._T_map_imu: F64 = np.empty((0, 3, 4))  # of each keyframe, as drawn
         self._view = View()
-        self._coloured: tuple[Limits | None, Limits | None] = None, None
+        self._look: tuple[object, ...] = ()  # what the colours were chosen by
         self._fixed: dict[str, Limits] = {}
         self.limits: dict[str, Limits] = {}
         self._start_ns = 0
@@ -110,7 +111,7 @@ class MapChunks:
 
     @property
     def points(self) -> int:
-        return sum(drawn.count for drawn in self._drawn)
+        return sum(int(np.count_nonzero(drawn.shown)) for drawn in self._drawn)
 
     @property
     def moving(self) -> int:
@@ -134,36 +135,36 @@ class MapChunks:
         self._keep(next((n for n, is_same in enumerate(same) if not is_same), min(len(chunks), len(self._drawn))))
         known = len(self._drawn)
         moved = self._move(poses[: len(chunks), :3])
-        for chunk, T in zip(chunks[known:], self._T_map_imu[known:], strict=True):
-            self._drawn.append(_Drawn(chunk, self._grown(chunk, T), light(chunk.points, T @ chunk.T_imu_lidar)))
+        for chunk, T_map_imu in zip(chunks[known:], self._T_map_imu[known:], strict=True):
+            T = T_map_imu @ chunk.T_imu_lidar
+            self._drawn.append(_Drawn(chunk, T, self._grown(chunk, T), light(chunk.points, T)))
         limits = self._of_keyframes() | ({view.colour_by: view.numbers.limits} if view.numbers is not None else {})
         if limits != self.limits:
             self.limits = limits
         ends = chosen_ends(self.limits, view.colour_by, view.ends)
-        seen, used = self._view, (ends.get(view.colour_by), ends.get(INTENSITY))
-        recolour = (view.colour_by, view.numbers, used) != (seen.colour_by, seen.numbers, self._coloured)
-        if view.tuning:
-            recolour = not seen.tuning or view.light != seen.light
-        recolour |= seen.tuning and not view.tuning
+        look: tuple[object, ...] = (view.colour_by, view.numbers, ends.get(view.colour_by), ends.get(INTENSITY))
+        if view.tuning:  # the map stands back, in one colour
+            look = (view.light,)
+        recolour, self._look = look != self._look, look
+        seen, self._view = self._view, view
         cut = (view.ceilings, view.moving, view.clip) != (seen.ceilings, seen.moving, seen.clip)
-        self._view, self._coloured = view, used
         parts = self._parts(chunks, known, eyes)
         for index, (drawn, chunk) in enumerate(zip(self._drawn, chunks, strict=True)):
             new = index >= known or chunk is not drawn.chunk or parts[index] != drawn.part
-            drawn.part = int(parts[index])
-            if new or ((cut or (moved[index] and view.clip is not None)) and self._shows_others(drawn, index)):
-                if chunk is not drawn.chunk:
-                    drawn.chunk = chunk
-                    drawn.light = light(chunk.points, self._T_map_imu[index] @ chunk.T_imu_lidar)
-                self._send(drawn, self._T_map_imu[index])
+            drawn.part, elsewhere = int(parts[index]), index < known and bool(moved[index])
+            if elsewhere:
+                drawn.T_map_lidar = self._T_map_imu[index] @ chunk.T_imu_lidar
+            if chunk is not drawn.chunk:
+                drawn.chunk, drawn.light = chunk, light(chunk.points, drawn.T_map_lidar)
+            if new or ((cut or (elsewhere and view.clip is not None)) and self._shows_others(drawn)):
+                self._send(drawn)
             elif drawn.handle is not None:
-                T = self._T_map_imu[index]
-                if moved[index]:
-                    place(drawn.handle, T @ chunk.T_imu_lidar)
+                if elsewhere:
+                    place(drawn.handle, drawn.T_map_lidar)
                 if view.map_point_size != seen.map_point_size or view.map != seen.map:
                     drawn.handle.point_size, drawn.handle.visible = self._size(drawn), view.map
-                if recolour or (moved[index] and view.colour_by in BY_POSE and not view.tuning):
-                    drawn.handle.colors = self._look(self._shown(drawn, T))
+                if recolour or (elsewhere and view.colour_by in BY_POSE and not view.tuning):
+                    drawn.handle.colors = self._colours(self._shown(drawn))
 
     def _parts(self, chunks: tuple[Chunk, ...], known: int, eyes: F64) -> I64:
         """(k,) how many points of each to draw now: less at once, more of known ones little by little."""
@@ -193,8 +194,8 @@ class MapChunks:
         self._T_map_imu = now
         return moved
 
-    def _grown(self, chunk: Chunk, T_map_imu: F64) -> dict[str, Limits]:
-        limits, cloud = self._of_keyframes(), self._cloud(chunk, T_map_imu, np.ones(len(chunk.points), np.bool_))
+    def _grown(self, chunk: Chunk, T_map_lidar: F64) -> dict[str, Limits]:
+        limits, cloud = self._of_keyframes(), self._cloud(chunk, T_map_lidar, np.ones(len(chunk.points), np.bool_))
         for name, mode in MODES.items():
             of_each = mode.fixed is None and not mode.of_map
             wider = grown(limits.get(name), mode, mode.values(cloud)) if of_each else None
@@ -204,54 +205,52 @@ class MapChunks:
 
     def shown(self) -> Iterator[tuple[F64, U8]]:
         """(n, 3) points of the map that are shown, whether or not the map is, and their (n, 3) colours."""
-        for drawn, T in zip(self._drawn, self._T_map_imu, strict=False):
-            cloud = self._shown(drawn, T)
-            T_map_lidar = cloud.T_map_lidar
-            yield lie.moved(T_map_lidar, cloud.points), self._colours(cloud)
+        for drawn in self._drawn:
+            cloud = self._shown(drawn)
+            yield lie.moved(drawn.T_map_lidar, cloud.points), self._coloured(cloud)
 
     def sample(self) -> F64:
         """(m, 3) some points of all keyframes, in the map."""
-        every = zip(self._drawn, self._T_map_imu, strict=False)
-        some = [(T @ drawn.chunk.T_imu_lidar, drawn.chunk.points[:_SAMPLE]) for drawn, T in every]
-        return np.concatenate([np.empty((0, 3)), *(lie.moved(T, points) for T, points in some)])
+        some = [lie.moved(drawn.T_map_lidar, drawn.chunk.points[:_SAMPLE]) for drawn in self._drawn]
+        return np.concatenate([np.empty((0, 3)), *some])
 
-    def _cloud(self, chunk: Chunk, T_map_imu: F64, shown: npt.NDArray[np.bool_], light: F32 | None = None) -> PointSet:
+    def _cloud(
+        self, chunk: Chunk, T_map_lidar: F64, shown: npt.NDArray[np.bool_], light: F32 | None = None
+    ) -> PointSet:
         numbers = self._view.numbers.of(chunk)[shown] if self._view.numbers is not None else None
-        T, seconds = T_map_imu @ chunk.T_imu_lidar, (chunk.stamp_ns - self._start_ns) * 1e-9
-        return PointSet.of(chunk, shown, T, seconds, light, chunk.index, numbers)
+        seconds = (chunk.stamp_ns - self._start_ns) * 1e-9
+        return PointSet.of(chunk, shown, T_map_lidar, seconds, light, chunk.index, numbers)
 
-    def _shown(self, drawn: _Drawn, T_map_imu: F64) -> PointSet:
-        return self._cloud(drawn.chunk, T_map_imu, drawn.shown, drawn.light[drawn.shown])
+    def _shown(self, drawn: _Drawn) -> PointSet:
+        return self._cloud(drawn.chunk, drawn.T_map_lidar, drawn.shown, drawn.light[drawn.shown])
 
-    def _chosen(self, drawn: _Drawn, T_map_imu: F64) -> npt.NDArray[np.bool_]:
-        T_map_lidar = T_map_imu @ drawn.chunk.T_imu_lidar
+    def _chosen(self, drawn: _Drawn) -> npt.NDArray[np.bool_]:
         view = self._view
-        return shown_points(drawn.chunk, T_map_lidar, view.ceilings, view.clip, drawn.part, moving=view.moving)
+        return shown_points(drawn.chunk, drawn.T_map_lidar, view.ceilings, view.clip, drawn.part, moving=view.moving)
 
-    def _shows_others(self, drawn: _Drawn, index: int) -> bool:
-        return not np.array_equal(self._chosen(drawn, self._T_map_imu[index]), drawn.shown)
+    def _shows_others(self, drawn: _Drawn) -> bool:
+        return not np.array_equal(self._chosen(drawn), drawn.shown)
 
-    def _send(self, drawn: _Drawn, T_map_imu: F64) -> None:
+    def _send(self, drawn: _Drawn) -> None:
         """Send a keyframe's points in place of those sent before.
 
         Under the same name instead of through the handle's properties: a page that connects later is
         then not sent what was thinned away.
         """
-        drawn.shown = self._chosen(drawn, T_map_imu)
-        cloud = self._shown(drawn, T_map_imu)
-        drawn.count = len(cloud.points)
-        if not drawn.count:  # the page cannot draw a cloud without points
+        drawn.shown = self._chosen(drawn)
+        if not drawn.shown.any():  # the page cannot draw a cloud without points
             if drawn.handle is not None:
                 drawn.handle.remove()
                 drawn.handle = None
             return
+        cloud = self._shown(drawn)
         drawn.handle = add_points(
             self._scene,
             f"{self._root}/{drawn.chunk.index}",
             cloud.points,
-            self._look(cloud),
+            self._colours(cloud),
             self._size(drawn),
-            cloud.T_map_lidar,
+            drawn.T_map_lidar,
             visible=self._view.map,
         )
 
@@ -262,11 +261,11 @@ class MapChunks:
         gap *= float((len(chunk.points) / max(drawn.part, 1)) ** _GAP_BY_SHARE)
         return self._view.map_point_size * max(1.0, _SIZE_BY_GAP * gap / self._view.point_size)
 
-    def _look(self, cloud: PointSet) -> U8:
-        """(n, 3) colours; one for all, (3,), while the map stands back."""
-        return np.array(DIMMED[self._view.light], np.uint8) if self._view.tuning else self._colours(cloud)
-
     def _colours(self, cloud: PointSet) -> U8:
+        """(n, 3) colours; one for all, (3,), while the map stands back."""
+        return np.array(DIMMED[self._view.light], np.uint8) if self._view.tuning else self._coloured(cloud)
+
+    def _coloured(self, cloud: PointSet) -> U8:
         by = self._view.colour_by
         return colours(cloud, by, chosen_ends(self.limits, by, self._view.ends))
 
