@@ -47,8 +47,8 @@ class KeepMeasure(KeptCommand, frozen=True):
     measure: Measure
 
 
-class RenameMeasure(KeptCommand, frozen=True):
-    """Give a measure of the session another name."""
+class EditMeasure(KeptCommand, frozen=True):
+    """Give a measure of the session another name; an empty one deletes it."""
 
     measure: Measure
     name: str
@@ -58,12 +58,6 @@ class SetClip(KeptCommand, frozen=True):
     """Show only a part of the map, or all of it. changes: new values of fields of `Clip`; the others stay."""
 
     changes: dict[str, Any]
-
-
-class DropMeasure(KeptCommand, frozen=True):
-    """Delete a measure from the session."""
-
-    measure: Measure
 
 
 class Paint(KeptCommand, frozen=True):
@@ -103,13 +97,11 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
                     f"A session holds at most {MOST_MEASURES} measures; this one was not added. Delete one first."
                 )
             return replace(kept, measures=(*measures, measure))
-        case RenameMeasure(measure, name):
-            if measure not in measures:
+        case EditMeasure(measure, name):
+            if name and measure not in measures:
                 raise HemislamError(f"Another page has changed that measure meanwhile; it was not renamed to “{name}”.")
-            renamed = replace(measure, name=name)
-            return replace(kept, measures=tuple(renamed if one == measure else one for one in measures))
-        case DropMeasure(measure):
-            return replace(kept, measures=tuple(one for one in measures if one != measure))
+            left = (one for one in measures if name or one != measure)
+            return replace(kept, measures=tuple(replace(one, name=name) if one == measure else one for one in left))
         case SetClip(changes):
             return replace(kept, clip=replace(kept.clip, **changes))
         case Paint(stroke):

@@ -9,7 +9,7 @@ import viser
 
 from app.georeference.reference import GeoReference
 from app.mapping.kept import Measure, Spot
-from app.server.keeping import DropMeasure, KeepMeasure, RenameMeasure
+from app.server.keeping import EditMeasure, KeepMeasure
 from app.server.protocol import Snapshot
 from app.slam.errors import HemislamError
 from app.slam.types import F64
@@ -168,7 +168,7 @@ class MeasurePanel:
         """What the list sends: "delete 3 door", the place and the name in the list as that browser shows it."""
         for place, (measure, *_) in enumerate(self._measured):
             if word == f"delete {place} {measure.name}":
-                self._page.send(DropMeasure(measure))
+                self._page.send(EditMeasure(measure, ""))
             elif word == f"rename {place} {measure.name}":
                 self._ask_name(measure, client)
 
@@ -176,7 +176,7 @@ class MeasurePanel:
         def rename(name: str) -> None:
             if not name.strip():
                 raise HemislamError("The name is empty; write one, or cancel.")
-            self._page.send(RenameMeasure(measure, name.strip()))
+            self._page.send(EditMeasure(measure, name.strip()))
 
         ask_text(client, "Rename measure", "name", measure.name, "Rename", rename)
 

@@ -11,7 +11,7 @@ from session_bench import Bench, last_notice
 from app.mapping.kept import Measure, Spot
 from app.mapping.session import Session
 from app.server import player
-from app.server.keeping import AddNote, EditNote, RenameMeasure
+from app.server.keeping import AddNote, EditMeasure, EditNote
 from app.server.protocol import (
     Command,
     CompareWith,
@@ -142,7 +142,7 @@ def test_a_note_is_changed_and_deleted_unless_another_page_has_changed_it() -> N
     assert [note.text for note in notes] == ["at the door", "there"]
     assert "Another page has changed that note" in last_notice(bench.see())
     gone = Measure("door", (Spot(0, (0.0, 0.0, 0.0)),))
-    assert "Another page has changed that measure" in last_notice(bench.do(RenameMeasure(gone, "gate")))
+    assert "Another page has changed that measure" in last_notice(bench.do(EditMeasure(gone, "gate")))
     assert [note.text for note in bench.do(EditNote(0, "at the door", "")).notes] == ["there"]
     assert bench.do(EditNote(5, "there", "")).notes == bench.do(EditNote(-1, "there", "")).notes != ()
 

@@ -27,10 +27,9 @@ from app.server.keeping import (
     MOST_MEASURES,
     MOST_NOTES,
     AddNote,
-    DropMeasure,
+    EditMeasure,
     KeepMeasure,
     KeepView,
-    RenameMeasure,
     SetClip,
 )
 from app.server.protocol import (
@@ -104,9 +103,9 @@ def walk_about(bench: Kept) -> Snapshot:
     bench.do(Seek(30), SetParams({"ground.sigma": 0.02}), Seek(60), Seek(45), SetParams({"scan.voxel_size": 0.6}))
     bench.do(Seek(80), Seek(70), AddNote("a turn"), KeepView(VIEW))
     wrong = Measure("wrong", DOOR.spots[:1])
-    bench.do(KeepMeasure(wrong), KeepMeasure(replace(DOOR, name="")), DropMeasure(wrong))
+    bench.do(KeepMeasure(wrong), KeepMeasure(replace(DOOR, name="")), EditMeasure(wrong, ""))
     bench.do(SetClip({"box": CLIP.box, "on": True}), SetClip({"slab": CLIP.slab}))
-    bench.do(RenameMeasure(replace(DOOR, name=""), DOOR.name), Calibrated(TURNED))
+    bench.do(EditMeasure(replace(DOOR, name=""), DOOR.name), Calibrated(TURNED))
     return bench.do(StepFrame(2), SetParams({"ground.alpha": 35.0}))
 
 

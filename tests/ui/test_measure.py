@@ -9,7 +9,7 @@ import pytest
 import viser
 
 from app.mapping.kept import Measure, Spot
-from app.server.keeping import DropMeasure, KeepMeasure, RenameMeasure
+from app.server.keeping import EditMeasure, KeepMeasure
 from app.server.protocol import Chunk, Command, Snapshot
 from app.slam import lie
 from app.slam.types import NON_GROUND
@@ -277,7 +277,7 @@ def test_the_list_deletes_a_measure_and_an_empty_list_is_not_there(server: viser
         assert not bench.sent
         bench.panel._act(word, None)  # type: ignore[arg-type]
     assert 'data-hs="delete 0 point 1"' in bench.panel._list.content
-    assert bench.sent == [DropMeasure(kept)]
+    assert bench.sent == [EditMeasure(kept, "")]
     bench.now = replace(bench.now, measures=())
     bench.panel.draw(bench.now, View())
     assert not bench.panel._list.visible and not bench.panel._save.visible
@@ -297,4 +297,4 @@ def test_a_measure_without_a_name_is_refused_in_words(
     assert bench.sent == [] and "The name is empty" in browser.told[0]
     user_sets(browser.added["name"], "door ")
     browser.clicks("Rename")
-    assert bench.sent == [RenameMeasure(bench.now.measures[0], "door")] and len(browser.told) == 1
+    assert bench.sent == [EditMeasure(bench.now.measures[0], "door")] and len(browser.told) == 1
