@@ -328,21 +328,21 @@ for fork in (False, True):
     assert (done.stdout.split(), done.stderr) == (["run", "hello", "hello"], "")
 
 
-def runs_nothing(owner: Link, folder: str) -> None:
+def runs_nothing(owner: Link) -> None:
     from app.evaluation.runner import run_jobs
 
-    run_jobs([], Path(folder), parallel=1, quiet=True)
+    run_jobs([], parallel=1, quiet=True)
     owner.send("ran")
     owner.receive()
 
 
-def test_runs_that_are_killed_leave_no_semaphore_of_which_python_would_warn(tmp_path: Path) -> None:
+def test_runs_that_are_killed_leave_no_semaphore_of_which_python_would_warn() -> None:
     code = f"""
 import sys
 sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}
 import test_child
 from app.child import Child
-child = Child(test_child.runs_nothing, {str(tmp_path)!r}, name="tune", title="The search", fork=True)
+child = Child(test_child.runs_nothing, name="tune", title="The search", fork=True)
 print(child.receive(60.0))
 child.close(0.0)
 """

@@ -24,7 +24,7 @@ from typing import Any
 from tqdm import tqdm
 
 from app import __version__
-from app.evaluation.job import RUN_FILES, Job, all_or_nothing, clear_remains, code_digest, finished
+from app.evaluation.job import RUN_FILES, Job, code_digest, finished, reopen
 from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 from app.slam.provenance import hash_input
@@ -60,13 +60,12 @@ class Cluster:
     url: str = ""
     wait_s: float = 120.0
 
-    def run_jobs(self, jobs: list[Job], folder: Path) -> dict[tuple[str, str], str]:
+    def run_jobs(self, jobs: list[Job]) -> dict[tuple[str, str], str]:
         """Run all jobs that are not finished yet, as `app.evaluation.runner.run_jobs` does.
 
         Raises:
             HemislamError: the cluster is not there, a worker has another version of hemislam, or lacks a recording.
         """
-        clear_remains(folder)
         errors: dict[tuple[str, str], str] = {}
         waiting = {job.folder: job for job in jobs if finished(job) is None}
         try:
@@ -329,6 +328,6 @@ def _fetch(address: str, job: Job) -> None:
 
 
 def _keep(job: Job, files: dict[str, bytes]) -> None:
-    with all_or_nothing(job) as part:
-        for name in RUN_FILES:
-            (part / name).write_bytes(files[name])
+    reopen(job)
+    for name in RUN_FILES:
+        (job.folder / name).write_bytes(files[name])

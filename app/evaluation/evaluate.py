@@ -92,7 +92,7 @@ def evaluate(
                 marks=subject.marks,
             )
     make_folder(folder / "runs")
-    failures = run(list(jobs.values()), folder / "runs")
+    failures = run(list(jobs.values()))
     evaluated = []
     for subject in subjects:
         outcomes = [

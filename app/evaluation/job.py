@@ -6,10 +6,6 @@ of all that the results depend on: a folder with the right key is finished and n
 
 import hashlib
 import json
-import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -110,23 +106,7 @@ def read_run(folder: Path) -> dict[str, Any] | None:
     return report if whole and isinstance(report, dict) else None
 
 
-@contextmanager
-def all_or_nothing(job: Job) -> Iterator[Path]:
-    """A folder for a run's files. At the end they are moved to their places, run.json last: a kill in between leaves
-    no result."""
-    part = job.folder.with_name(f".{job.folder.name}.part-{os.getpid()}")  # no variant's name begins with a dot
-    part.mkdir(parents=True, exist_ok=True)
-    try:
-        yield part
-        job.folder.mkdir(exist_ok=True)
-        (job.folder / "run.json").unlink(missing_ok=True)
-        for name in RUN_FILES:
-            (part / name).replace(job.folder / name)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
-def clear_remains(folder: Path) -> None:
-    """Remove what runs that were killed left in the making."""
-    for part in folder.glob("*/.*.part-*"):
-        shutil.rmtree(part, ignore_errors=True)
+def reopen(job: Job) -> None:
+    """Its folder, not finished any more. run.json is written last, so a kill before that leaves no result."""
+    job.folder.mkdir(parents=True, exist_ok=True)
+    (job.folder / "run.json").unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from app import __version__
 from app.baselines.poses import keep_keyframe
 from app.baselines.systems import find_system
 from app.evaluation import crops, map_sharpness
-from app.evaluation.job import GROUND_RANGES_M, Job, all_or_nothing
+from app.evaluation.job import GROUND_RANGES_M, Job, reopen
 from app.export.exports import timings_csv
 from app.mapping.feed import FeedInfo, FileFeed
 from app.mapping.opening import open_session
@@ -167,17 +167,14 @@ def _write(
     measured = map_sharpness.measure(map_sharpness.collect(part_of_map(), poses))
     facts |= {"frames": len(trajectory), "distance_m": trajectory.distance, "map_sharpness": finite(asdict(measured))}
     timings = timings_csv(trajectory.stamps_ns, times[counted, :-1], {"cpu_ms": times[counted, -1]})
-    with all_or_nothing(job) as part:
-        write_tum(part / "trajectory.tum", trajectory)
-        (part / "timings.csv").write_text(timings, encoding="utf-8")
-        centres = {place: _position_at(trajectory, share) for place, share in crops.PLACES.items()}
-        np.savez_compressed(
-            part / "crops.npz",
-            allow_pickle=False,
-            **{place: crops.crop(part_of_map(), poses, centre) for place, centre in centres.items()},
-        )
-        text = json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
-        (part / "run.json").write_text(text, encoding="utf-8", errors="backslashreplace")  # a path need not be UTF-8
+    reopen(job)
+    write_tum(job.folder / "trajectory.tum", trajectory)
+    (job.folder / "timings.csv").write_text(timings, encoding="utf-8")
+    centres = {place: _position_at(trajectory, share) for place, share in crops.PLACES.items()}
+    pieces = {place: crops.crop(part_of_map(), poses, centre) for place, centre in centres.items()}
+    np.savez_compressed(job.folder / "crops.npz", allow_pickle=False, **pieces)
+    text = json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
+    (job.folder / "run.json").write_text(text, encoding="utf-8", errors="backslashreplace")  # a path need not be UTF-8
 
 
 def _score_ground(scores: list[GroundScore], result: StepResult, marks: dict[int, bytes]) -> None:

@@ -6,14 +6,13 @@ With a process for each job, its peak memory is its own, and a crash costs one c
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from pathlib import Path
 from time import monotonic
 from typing import NoReturn
 
 from tqdm import tqdm
 
 from app.child import Child, ChildDied, Link
-from app.evaluation.job import Job, clear_remains, finished
+from app.evaluation.job import Job, finished
 from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 
@@ -21,13 +20,12 @@ REPORT_EVERY_S = 0.2
 tqdm.set_lock(threading.RLock())  # its own is a semaphore of processes, which stays where this one is killed
 
 
-RunJobs = Callable[[list[Job], Path], dict[tuple[str, str], str]]
-"""Runs jobs, given the folder of all runs; on this machine or on a cluster."""
+RunJobs = Callable[[list[Job]], dict[tuple[str, str], str]]
+"""Runs jobs, on this machine or on a cluster."""
 
 
 def run_jobs(
     jobs: list[Job],
-    folder: Path,
     *,
     parallel: int,
     quiet: bool = False,
@@ -41,7 +39,6 @@ def run_jobs(
     Returns:
         Why jobs failed, by (recording, variant); those not named are finished.
     """
-    clear_remains(folder)
     todo = [job for job in jobs if finished(job) is None]
     before = len(jobs) - len(todo)
     for _ in range(before):

@@ -110,7 +110,7 @@ class Runs:
         """For each setting its scores by objective, and why it failed ("" if it did not)."""
         jobs = [[self._job(index, setting, part) for index in range(len(self._subjects))] for setting in settings]
         each = {job.folder: job for of_setting in jobs for job in of_setting}
-        errors = self._run(list(each.values()), self._folder)
+        errors = self._run(list(each.values()))
         return [self._scored(of_setting, errors) for of_setting in jobs]
 
     def _job(self, index: int, values: Mapping[str, Any], part: Part) -> Job:

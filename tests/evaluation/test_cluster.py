@@ -129,7 +129,7 @@ def test_a_worker_without_the_recording_is_sent_it(
     monkeypatch.setattr(cluster, "_has", lambda job: False)
     monkeypatch.setattr(cluster, "PIECE", 100_000)
     jobs = [job_of(away, tmp_path / name) for name in ("first", "again")]
-    assert Cluster(site.address).run_jobs(jobs, tmp_path) == {}
+    assert Cluster(site.address).run_jobs(jobs) == {}
     assert [finished(job) is not None for job in jobs] == [True, True]
 
 
@@ -159,7 +159,7 @@ def test_a_recording_that_cannot_be_used_costs_its_own_run_only(site: Site, reco
     empty = tmp_path / "empty.mcap"
     empty.write_bytes(b"")
     good, bad = job_of(recording, tmp_path / "good"), job_of(empty, tmp_path / "bad")
-    errors = Cluster(site.address).run_jobs([good, bad], tmp_path)
+    errors = Cluster(site.address).run_jobs([good, bad])
     assert finished(good) is not None
     assert list(errors) == [("walk", "bad")] and "empty.mcap" in errors["walk", "bad"]
 
@@ -173,6 +173,6 @@ def test_no_scheduler_and_other_versions_are_reported_in_a_sentence(
     monkeypatch.setattr(cluster, "CONNECT_S", 15.0)
     monkeypatch.setattr(cluster, "__version__", "99.0")
     with pytest.raises(HemislamError, match=r"has version .*, and this is 99.0"):
-        Cluster(site.address).run_jobs([job_of(recording, tmp_path / "run")], tmp_path)
+        Cluster(site.address).run_jobs([job_of(recording, tmp_path / "run")])
     result = evaluate(recording, tmp_path / "data", "--cluster-data", "s3://bucket")
     assert result.exit_code == 2 and "belongs to --cluster" in result.output

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.cli.evaluate import read_subjects
+from app.evaluation.job import RUN_FILES
 from app.evaluation.variants import PAPER, choose_variants, parse_variant
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -158,14 +159,14 @@ def test_killed_at_any_moment_and_started_again_it_gives_the_same_tables(
 
     begin = time.monotonic()
     kill_when(lambda: time.monotonic() > begin + 2.0)  # before the first results
-    kill_when(lambda: any(runs.glob("*.part-*")))  # in the middle of writing results
+    kill_when(lambda: any(runs.glob("*/trajectory.tum")))  # in the middle of writing results
     kill_when(lambda: any(runs.glob("*/run.json")))  # some are finished, some are not
     survived = {path: path.stat().st_mtime_ns for path in runs.glob("*/run.json")}
     done = call(*arguments)
     assert done.exit_code == 0, done.output
     assert deterministic(tmp_path) == deterministic(whole)
     assert survived.items() <= {path: path.stat().st_mtime_ns for path in runs.glob("*/run.json")}.items()
-    assert not list(runs.glob("*.part-*"))
+    assert all({path.name for path in run.iterdir()} == set(RUN_FILES) for run in runs.iterdir())
 
 
 def test_a_variant_is_a_name_and_parameters() -> None:

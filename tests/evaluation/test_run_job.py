@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.evaluation.job import RUN_FILES, Job, all_or_nothing, clear_remains, finished
+from app.evaluation.job import RUN_FILES, Job, finished, reopen
 from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -54,15 +54,15 @@ def test_a_recording_whose_name_is_not_utf_8_is_run_to_its_end(recording: Path, 
     assert facts is not None and facts["recording"] == str(other)
 
 
-@pytest.mark.parametrize("variant", ["a.part-b", "a.part-1", "a"])
-def test_what_a_killed_run_left_is_removed_and_a_finished_run_of_any_name_stays(tmp_path: Path, variant: str) -> None:
-    job = Job(tmp_path / "walk.mcap", "x", "walk", variant, Params(), tmp_path / "walk" / variant)
-    with all_or_nothing(job) as part:
-        for name in RUN_FILES:
-            (part / name).write_text(f'{{"key": "{job.key}"}}')
-    with pytest.raises(OSError, match="full"), all_or_nothing(job) as killed:
-        left = killed.parent / f"{killed.name}9"
-        left.mkdir()
-        raise OSError("the disk is full")
-    clear_remains(tmp_path)
-    assert finished(job) and [path.name for path in (tmp_path / "walk").iterdir()] == [variant]
+def test_a_run_whose_writing_ends_early_is_not_finished_even_if_one_before_was(tmp_path: Path) -> None:
+    job = Job(tmp_path / "walk.mcap", "x", "walk", "a", Params(), tmp_path / "walk" / "a")
+    whole = f'{{"key": "{job.key}"}}'
+    reopen(job)
+    for name in RUN_FILES:
+        (job.folder / name).write_text(whole)
+    assert finished(job)
+    reopen(job)
+    assert finished(job) is None
+    for length in range(len(whole)):  # run.json comes last
+        (job.folder / "run.json").write_text(whole[:length])
+        assert finished(job) is None
