@@ -107,15 +107,9 @@ class PacketReceiver:
         model = device.model
         self._decoder = Decoder(angles, model) if isinstance(model, Model) else None
         self._clouds = CloudReader(params, device.layout.lidar_topic, CLOUD_TYPES[device.layout.kind])
-        self._sockets: list[socket.socket] = []
-        try:
-            for number, port in enumerate(ports):
-                if port not in ports[:number]:
-                    self._sockets.append(open_socket(host, port))
-        except HemislamError:
-            for opened in self._sockets:
-                opened.close()
-            raise
+        with contextlib.ExitStack() as opened:  # closes those before a port that cannot be opened
+            self._sockets = [opened.enter_context(open_socket(host, port)) for port in dict.fromkeys(ports)]
+            self._opened = opened.pop_all()
         if self._decoder is not None:
             self._decoder.warm_up()
         self._model, self._models = model, device.models
@@ -133,9 +127,7 @@ class PacketReceiver:
         self._assembler.counters = self._order.counters = intake.counters
         if self._decoder is not None:
             self._decoder.bad_blocks = intake.counters.bad_blocks
-        with contextlib.ExitStack() as stack:
-            for opened in self._sockets:
-                stack.enter_context(opened)
+        with self._opened:
             while not stop.is_set():
                 ready, _, _ = select.select(self._sockets, [], [], 0.05)
                 now = time.time_ns()
