@@ -6,6 +6,7 @@ from app.sensors.live.difop import ChannelAngles, Difop
 from app.sensors.live.frames import Revolution
 from app.sensors.live.kernels import decode_blocks
 from app.sensors.live.msop import HEADER_BYTES, PACKET_BYTES, TURN
+from app.sensors.live.status import Counters
 from app.sensors.robosense import BPEARL, Model
 from app.slam.errors import HemislamError
 from app.slam.types import F64, U16, DroppedScan, Scan
@@ -19,7 +20,7 @@ class Decoder:
 
     Attributes:
         calibration: the one in use: from a file, else the device's own, else the nominal one.
-        difop: the device's settings. bad_blocks: number of blocks without their mark or azimuth.
+        difop: the device's settings. counters: count the blocks without their mark or azimuth.
     """
 
     def __init__(self, angles: ChannelAngles | None = None, model: Model = BPEARL) -> None:
@@ -30,7 +31,7 @@ class Decoder:
                 "use this unit's own."
             )
         self._angles, self._model = angles, model
-        self.bad_blocks = 0
+        self.counters = Counters()
         self.configure(Difop())
 
     def configure(self, difop: Difop) -> None:
@@ -48,7 +49,7 @@ class Decoder:
         packets = np.zeros((1, PACKET_BYTES), np.uint8)
         packets.setflags(write=False)
         self.decode(Revolution(self._model, packets, np.zeros(1, np.int64), 0, self._model.blocks, 0))
-        self.bad_blocks = 0
+        self.counters = Counters()
 
     def decode(self, frame: Revolution) -> Scan | DroppedScan:
         """The scan in firing order: block by block, in each by channel."""
@@ -68,7 +69,7 @@ class Decoder:
             round(MIN_RANGE_M / model.range_step), round(MAX_RANGE_M / model.range_step), model.rx, model.rz,
             points, times, intensity, ring,
         )  # fmt: skip
-        self.bad_blocks += bad
+        self.counters.bad_blocks += bad
         if not n:
             return DroppedScan(base_ns, "none of its firings returned")
         times = times[:n]

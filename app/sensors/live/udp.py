@@ -126,7 +126,7 @@ class PacketReceiver:
     def __call__(self, intake: Intake, stop: threading.Event) -> None:
         self._assembler.counters = self._order.counters = intake.counters
         if self._decoder is not None:
-            self._decoder.bad_blocks = intake.counters.bad_blocks
+            self._decoder.counters = intake.counters
         with self._opened:
             while not stop.is_set():
                 ready, _, _ = select.select(self._sockets, [], [], 0.05)
@@ -226,9 +226,7 @@ class PacketReceiver:
         """The scans that can be given now, each with its arrival."""
         if self._decoder is None:
             return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns, intake)
-        scan = self._decoder.decode(frame)
-        intake.counters.bad_blocks = self._decoder.bad_blocks
-        return [(scan, frame.arrival_ns)]
+        return [(self._decoder.decode(frame), frame.arrival_ns)]
 
 
 class ImuReceiver:
