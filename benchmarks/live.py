@@ -26,7 +26,7 @@ from app.sensors.live.urls import parse_address
 from app.sensors.presets import resolve_params
 from benchmarks.client import PROTOCOL, listening
 from benchmarks.record import Line
-from benchmarks.scenes import half_hour, half_hour_in_laps, walk_in_laps
+from benchmarks.scenes import half_hour_in_laps, outdoors, walk_in_laps
 
 MINUTES = float(os.environ.get("HEMISLAM_LIVE_MINUTES", "4"))
 SPEED = float(os.environ.get("HEMISLAM_LIVE_SPEED", "1"))
@@ -41,7 +41,8 @@ SETTLE_S = 3.0
 
 
 def run() -> list[Line]:
-    walk = walk_in_laps() if MINUTES * SPEED <= 8 else half_hour_in_laps() if LAPS else half_hour()
+    minutes = MINUTES * SPEED
+    walk = walk_in_laps() if minutes <= 8 else half_hour_in_laps() if LAPS else outdoors(30 if minutes <= 30 else 60)
     with TemporaryDirectory() as folder, served(walk, Path(folder) / "live.mcap") as (url, server, packets, imu):
         ended = threading.Event()
         wait_until(url, lambda state: state["recording"] is not None)

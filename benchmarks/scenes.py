@@ -26,9 +26,9 @@ def walk_in_laps() -> Path:
     return _simulated("laps.mcap", "building", 480.0, seed=3, every_block=6)
 
 
-def half_hour() -> Path:
-    """Half an hour outdoors, with one azimuth of 6: 870 m of new ground, then along the same way again."""
-    return _simulated("half-hour.mcap", "outdoor_3", 1830.0, seed=7, every_block=6)
+def outdoors(minutes: int) -> Path:
+    """Outdoors with one azimuth of 6: 870 m of new ground in a quarter of an hour, then along the same way again."""
+    return _simulated(f"outdoors-{minutes}-min.mcap", "outdoor_3", 60.0 * minutes + 30.0, seed=7, every_block=6)
 
 
 def half_hour_in_laps() -> Path:
