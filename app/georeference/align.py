@@ -39,7 +39,7 @@ NEARBY_S = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6)
 WORST_YAW, WORST_OFFSET_S, WORST_LEVER_M = np.radians(10.0), 0.1, 0.1
 """Values that are less certain than this (standard deviation) are not taken from the fixes."""
 NOTABLE_SCATTER = 3.0
-"""Scatter above which the user is told, in multiples of the standard deviations that the fixes report."""
+"""The user is warned if residuals scatter by more than this many times the standard deviations that fixes report."""
 FEWEST = 8
 COARSE_FIXES = 200
 MOST_STEPS = 50

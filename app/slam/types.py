@@ -1,4 +1,4 @@
-"""Values that pass between the rooms. Frozen; their arrays are read-only.
+"""Values that pass between the packages. Frozen; their arrays are read-only.
 
 Conventions (all of hemislam):
 - `T_target_source` maps coordinates of `source` into `target`; 4x4 float64, or (R, p).

@@ -164,7 +164,7 @@ class MapChunks:
                 if view.map_point_size != seen.map_point_size or view.map != seen.map:
                     drawn.handle.point_size, drawn.handle.visible = self._size(drawn), view.map
                 if recolour or (elsewhere and view.colour_by in BY_POSE and not view.tuning):
-                    drawn.handle.colors = self._colours(self._shown(drawn))
+                    drawn.handle.colors = self._drawn_colours(self._shown(drawn))
 
     def _parts(self, chunks: tuple[Chunk, ...], known: int, eyes: F64) -> I64:
         """(k,) how many points of each to draw now: less at once, more of known ones little by little."""
@@ -207,7 +207,7 @@ class MapChunks:
         """(n, 3) points of the map that are shown, whether or not the map is, and their (n, 3) colours."""
         for drawn in self._drawn:
             cloud = self._shown(drawn)
-            yield lie.moved(drawn.T_map_lidar, cloud.points), self._coloured(cloud)
+            yield lie.moved(drawn.T_map_lidar, cloud.points), self._colours(cloud)
 
     def sample(self) -> F64:
         """(m, 3) some points of all keyframes, in the map."""
@@ -248,7 +248,7 @@ class MapChunks:
             self._scene,
             f"{self._root}/{drawn.chunk.index}",
             cloud.points,
-            self._colours(cloud),
+            self._drawn_colours(cloud),
             self._size(drawn),
             drawn.T_map_lidar,
             visible=self._view.map,
@@ -261,11 +261,11 @@ class MapChunks:
         gap *= float((len(chunk.points) / max(drawn.part, 1)) ** _GAP_BY_SHARE)
         return self._view.map_point_size * max(1.0, _SIZE_BY_GAP * gap / self._view.point_size)
 
-    def _colours(self, cloud: PointSet) -> U8:
+    def _drawn_colours(self, cloud: PointSet) -> U8:
         """(n, 3) colours; one for all, (3,), while the map stands back."""
-        return np.array(DIMMED[self._view.light], np.uint8) if self._view.tuning else self._coloured(cloud)
+        return np.array(DIMMED[self._view.light], np.uint8) if self._view.tuning else self._colours(cloud)
 
-    def _coloured(self, cloud: PointSet) -> U8:
+    def _colours(self, cloud: PointSet) -> U8:
         by = self._view.colour_by
         return colours(cloud, by, chosen_ends(self.limits, by, self._view.ends))
 

@@ -77,7 +77,7 @@ def test_a_click_right_after_typing_takes_all_that_was_typed(bench: Bench) -> No
     assert box is not None
     page.keyboard.type("cracked wall")
     page.mouse.click(box["x"] + 20, box["y"] + 10)
-    bench.eventually(lambda: bench.engine.sent == [AddNote("cracked wall")], 20)
+    assert bench.within(20.0, lambda: bench.engine.sent == [AddNote("cracked wall")])
     page.get_by_role("tab", name="Parameters").click()
 
 
@@ -101,7 +101,7 @@ def test_a_click_on_a_busy_page_takes_all_that_was_typed(bench: Bench) -> None:
           button.click();
         }"""
     )
-    bench.eventually(lambda: bench.engine.sent == [AddNote("damp wall")], 20)
+    assert bench.within(20.0, lambda: bench.engine.sent == [AddNote("damp wall")])
     page.get_by_role("tab", name="Parameters").click()
 
 
