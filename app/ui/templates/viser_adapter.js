@@ -4,28 +4,32 @@ if (!window.hemislamSay) {
   // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, of
   // all controls together. So a word waits until nothing has changed for as long, not even by the word before; of two
   // words that ask for the same thing the later one counts, but every press that asks for a step does. On a busy page
-  // viser's timer may be late and run after ours. It has run by the time of a further timer that ours sets, no sooner.
+  // timers run late: one that is due later than viser's runs later, but one without any delay may run before it.
   const QUIET_MS = 60;
   let said = 0, presses = 0, sending = 0, changed = -QUIET_MS;
   const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set, waiting = new Map();
+  const whenQuiet = (act, since) => setTimeout(act, Math.max(since + QUIET_MS - performance.now(), 1));
+  const sendWhenQuiet = () => {
+    clearTimeout(sending);
+    if (waiting.size) sending = whenQuiet(send, changed);
+  };
   for (const kind of ['input', 'click', 'keydown', 'pointermove']) {
     document.addEventListener(kind, (event) => {
       if (event.target.closest?.('canvas,[data-hs-to]') || (kind === 'pointermove' && !event.buttons)) return;
-      if (kind !== 'keydown' || event.target.closest?.('[role=slider]')) changed = performance.now();
+      if (kind === 'keydown' && !event.target.closest?.('[role=slider]')) return;
+      changed = performance.now();
+      sendWhenQuiet();
     }, true);
   }
-  const send = (again) => {
-    const rest = changed + QUIET_MS - performance.now(), [next] = waiting;
-    sending = next && (rest > 0 || !again) ? setTimeout(send, Math.max(rest, 0), rest <= 0) : 0;
-    if (sending || !next) return;
-    const [key, [name, word]] = next, bridge = document.querySelector(`.hs-bridge[data-name="${name}"]`);
+  const send = () => {
+    const [[key, [name, word]]] = waiting, bridge = document.querySelector(`.hs-bridge[data-name="${name}"]`);
     waiting.delete(key);
     const input = bridge?.parentElement.previousElementSibling.querySelector('input'); // or it was taken off the page
     if (input) {
       set.call(input, word + ' #' + (++said) + Math.random().toString(36).slice(2, 6));
       input.dispatchEvent(new Event('input', {bubbles: true}));
     }
-    send(false);
+    sendWhenQuiet();
   };
   window.hemislamSay = (event) => {
     const element = event.target.closest && event.target.closest('[data-hs]');
@@ -34,17 +38,17 @@ if (!window.hemislamSay) {
     if (event.detail > 1 && /^(delete|drop) /.test(word)) return; // of a double click, the second one meets the next line
     const [kind] = word.split(' '), press = kind === 'step' && !event.held ? ++presses : '';
     waiting.set(`${name} ${kind} ${press}`, [name, word]);
-    if (!sending) sending = setTimeout(send);
+    sendWhenQuiet();
   };
 
   // For the same reason a click on one of viser's buttons waits until what was typed before it has been sent.
   let typed = 0;
   document.addEventListener('input', () => { typed = performance.now(); }, true);
   document.addEventListener('click', (event) => {
-    const button = event.target.closest('.mantine-Button-root'), rest = typed + QUIET_MS - performance.now();
+    const button = event.target.closest('.mantine-Button-root');
     if (!button || !typed) return;
     event.stopImmediatePropagation();
-    setTimeout(() => setTimeout(() => { typed = 0; button.click(); }), Math.max(rest, 0));
+    whenQuiet(() => { typed = 0; button.click(); }, typed);
   }, true);
 
   // On a phone the panel is low, its tabs alone, until one is tapped; the same one lowers it again.
