@@ -1,14 +1,14 @@
-"""Who may talk to the server. Checked for every request and every WebSocket, before anything else.
+"""Access control, checked for every request and every WebSocket before anything else.
 
-- A page of another site must not reach this server through the user's browser: its Origin is refused.
+- A page of another site must not reach this server through the user's browser: requests with its Origin are refused.
 - On a loopback address there is no token, so the Host must be a loopback name (DNS rebinding).
-- On any other address a token is needed: once in the link, then in a cookie, or as a bearer token.
-- A second token is view only. Its requests must be GET, and its page may send nothing but the position of its
-  camera (`bridge.py`).
+- On any other address a token is needed: first in the link and then in a cookie, or as a bearer token.
+- A second token is view-only. Its requests must be GET, and its page may send only the position of its camera
+  (`bridge.py`).
 - A request has a limited size, and its body must arrive within a limited time.
 
-Against hosts that open many connections and send half requests, put a reverse proxy in front
-(`docs/guide/serving.md`).
+To protect the server from hosts that open many connections and send incomplete requests, put a reverse proxy in
+front of it (`docs/guide/serving.md`).
 """
 
 import asyncio
@@ -35,7 +35,7 @@ RESPONSE_HEADERS: Final = {
             "style-src 'self' 'unsafe-inline'",
             "img-src 'self' data: blob:",
             "font-src 'self' data:",
-            "connect-src 'self' data: blob:",  # the page would follow ?websocket= to any host
+            "connect-src 'self' data: blob:",  # otherwise ?websocket= in the link could send the page to any host
             "object-src 'none'",
             "base-uri 'none'",
             "form-action 'self'",
@@ -47,12 +47,12 @@ RESPONSE_HEADERS: Final = {
 }
 
 MOST_BYTES: Final = 1 << 20
-"""Most bytes of a request's body, and of a file uploaded in the page, which is YAML of some kilobytes."""
+"""Maximum size in bytes of a request's body, and of a file uploaded in the page (YAML of a few kilobytes)."""
 MOST_OF_MESSAGE: Final = 2 * MOST_BYTES
 MOST_OF_PICTURE: Final = 48 * MOST_BYTES
-"""Most bytes of a WebSocket message from a page, and of a picture that the page was asked to render."""
+"""Maximum size in bytes of a WebSocket message from a page, and of a picture that the page was asked to render."""
 MOST_BYTES_AT_ONCE: Final = 16 * MOST_BYTES
-"""Most bytes of the bodies of all requests that are being read or answered."""
+"""Maximum total size in bytes of the bodies of all requests being read or answered."""
 BODY_S: Final = 30.0
 """A request's whole body must arrive within this time; the largest body needs 35 kB/s."""
 
@@ -60,7 +60,7 @@ VIEWER: Final = "hemislam.viewer"
 """Key in the scope of requests that came with the view-only token."""
 
 OPEN_PATHS: Final = ("/healthz",)
-"""Paths that are answered without a token: they only say whether the server works."""
+"""Paths answered without a token: they only say whether the server works."""
 
 log = logging.getLogger(__name__)
 
@@ -145,7 +145,7 @@ class Guard:
             except TimeoutError:
                 raise HTTPException(408, "The request took too long.", {"Connection": "close"}) from None
             if not message.get("more_body", False):
-                until = None  # from here on, the only thing to wait for is that the client leaves
+                until = None  # from here on, wait only for the client to disconnect
             length = len(message.get("body", b""))
             received += length
             self._held += length

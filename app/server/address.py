@@ -11,7 +11,7 @@ from app.server.bridge import BUFFER_BYTES
 from app.slam.errors import HemislamError
 
 UNREAD_S: Final = 120
-"""A connection whose peer takes no data for this long is closed by the system (Linux)."""
+"""The system closes a connection whose peer accepts no data for this long (Linux)."""
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -24,7 +24,7 @@ def listen(host: str, port: int) -> socket.socket:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except OSError:
         raise HemislamError(f"{host} is not an address of this machine; choose another one by --host.") from None
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # protocol named, else asyncio keeps Nagle
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # named, or asyncio keeps Nagle
     if os.name == "posix":  # on Windows it would let two servers share the port
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)

@@ -37,16 +37,16 @@ from app.slam.types import MOVING, NON_GROUND
 
 EXPORT_TIMEOUT_S = 600.0
 MOST_EXPORTS = 4
-"""Most exports at the same time. Each holds one of the forty threads that answer requests."""
+"""Maximum number of exports at the same time. Each occupies one of the forty threads that answer requests."""
 
 
 # --- actions -------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Action:
-    """The command that `{"action": NAME, ...}` in a request's body sends to the engine.
+    """Makes the command that `{"action": NAME, ...}` in a request's body sends to the engine.
 
     Attributes:
-        command: makes the command from the fields. fields: as `pydantic.create_model` takes them.
+        command: makes the command from the fields. fields: in the form that `pydantic.create_model` takes.
     """
 
     command: Callable[..., Command]
@@ -57,14 +57,14 @@ def _edit(kind: Callable[..., LoopEdit]) -> Callable[..., Command]:
     return lambda **fields: protocol.EditLoop(kind(**fields))
 
 
-Index = Annotated[int, Field(ge=0, le=10**12 - 1)]  # session files hold no longer numbers
+Index = Annotated[int, Field(ge=0, le=10**12 - 1)]  # session files hold no larger numbers
 Count = Annotated[int, Field(ge=1)]
 Weight = Annotated[float, Field(gt=0, description="Divides the loop's covariance.")]
-Registered = Annotated[bool, Field(description="Register the two submaps; false ties them where the graph has them.")]
+Registered = Annotated[bool, Field(description="Register the two submaps; false: keep their pose in the graph.")]
 Label = Annotated[int, Field(ge=NON_GROUND, le=MOVING)]
 Labels = Annotated[
     Label | tuple[Label, ...],
-    Field(description="For all points of the keyframe, or one for each: 0 not ground, 1 ground, 2 a seed, 3 moving."),
+    Field(description="One label for all points, or one per point: 0 not ground, 1 ground, 2 seed, 3 moving."),
 ]
 PAIR = {"older": (Index, ...), "newer": (Index, ...)}
 
@@ -92,13 +92,13 @@ LOOPS = {
 
 
 class _Body(BaseModel):
-    """The body of a request. A trailing `_` is not part of a field's name: pydantic itself uses `register`."""
+    """The body of a request. A `_` at the end of a field's name is removed: pydantic itself uses `register`."""
 
     model_config = ConfigDict(extra="forbid", alias_generator=lambda name: name.removesuffix("_"))
 
 
 def _bodies(actions: Mapping[str, Action]) -> Any:
-    """The type of a body that names one of the actions."""
+    """The type of a request body that names one of the actions."""
     models = []
     for name, action in actions.items():
         fields: dict[str, Any] = {f"{field}_": definition for field, definition in action.fields.items()}
@@ -110,7 +110,7 @@ def _bodies(actions: Mapping[str, Action]) -> Any:
 def _add_actions(
     router: APIRouter, path: str, engine: RunningEngine, actions: Mapping[str, Action], summary: str
 ) -> None:
-    """Add a route that sends the engine the command of the action named in the body."""
+    """Add a route that takes the name of an action in the body and sends its command to the engine."""
 
     def post(body: Any) -> None:
         fields = body.model_dump(by_alias=True)
@@ -128,7 +128,7 @@ class NoteBody(_Body):
 class OpenBody(_Body):
     path: str = Field(description="A recording or session in the folders given by --folder.")
     truth: str | None = Field(
-        None, description="A TUM file in the same folders; null: the one beside the recording, if any."
+        None, description="A TUM file in the same folders; null: the truth file beside the recording, if any."
     )
 
 
@@ -148,22 +148,22 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
 
     @router.get("/state")
     def state() -> StateView:
-        """What the session is doing now."""
+        """Get the state of the session."""
         return state_view(engine.snapshot)
 
     @router.get("/params")
     def params() -> Params:
-        """All parameters as chosen; the schema holds their ranges, units and meanings."""
+        """Get all parameters. Their ranges, units and meanings are in the schema."""
         return engine.snapshot.params
 
     @router.get("/params.yaml", response_class=PlainTextResponse)
     def params_yaml() -> str:
-        """The same as commented YAML, fit for --config."""
+        """Get all parameters as commented YAML, which --config accepts."""
         return engine.snapshot.params.to_yaml()
 
     @router.patch("/params")
     def change(tree: dict[str, dict[str, Any]]) -> Params:
-        """Change some, for example {"ground": {"alpha": 30}}. If one of them cannot be used, none is changed."""
+        """Change parameters, for example {"ground": {"alpha": 30}}. If one value is invalid, none is changed."""
         after = engine.snapshot.params.merged(tree)
         values = {f"{section}.{name}": value for section, part in tree.items() for name, value in part.items()}
         _send(engine, protocol.SetParams(values))
@@ -174,23 +174,23 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         "/transport",
         engine,
         TRANSPORT,
-        'Play, pause, step, seek, set the speed ("max": no limit), start again.',
+        'Play, pause, step, seek, set the speed ("max": no limit), or restart.',
     )
 
     @router.get("/breakpoints")
     def breakpoints() -> Breakpoints:
-        """Where playing pauses."""
+        """Get the conditions at which playback pauses."""
         return engine.snapshot.breakpoints
 
     @router.put("/breakpoints")
     def set_breakpoints(body: Breakpoints) -> Breakpoints:
-        """Replace the breakpoints. The notices in the state say why playing paused."""
+        """Replace the breakpoints. The notices in the state say why playback paused."""
         _send(engine, protocol.SetBreakpoints(body))
         return body
 
     @router.get("/loops")
     def loops() -> LoopsState:
-        """Loop candidates with their verdicts, and the user's edits."""
+        """List the loop candidates with their verdicts, and the user's edits."""
         return loops_state(engine.snapshot.loops)
 
     _add_actions(
@@ -198,34 +198,37 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         "/loops",
         engine,
         LOOPS,
-        "Accept, reject, weigh or add a loop; solve all factors at once (Levenberg-Marquardt); undo or redo an edit.",
+        "Accept, reject or add a loop, or change its weight; solve all factors at once (Levenberg-Marquardt);"
+        " undo or redo an edit.",
     )
 
-    _add_actions(router, "/labels", engine, LABELS, "Change the labels of a keyframe's points; undo the last change.")
+    _add_actions(
+        router, "/labels", engine, LABELS, "Change the labels of a keyframe's points, or undo the last change."
+    )
 
     @router.post("/notes", status_code=202)
     def add_note(body: NoteBody) -> None:
-        """Add a note on the current frame to the session; the state lists them."""
+        """Add a note on the current frame to the session. The state lists all notes."""
         _send(engine, AddNote(body.text))
 
     @router.put("/notes/{place}", status_code=202)
     def edit_note(place: Index, body: NoteBody) -> None:
-        """Replace the text of the note with this place in the state's list."""
+        """Replace the text of a note. `place` is its index in the list of notes in the state."""
         _send(engine, EditNote(place, _note(engine, place), body.text))
 
     @router.delete("/notes/{place}", status_code=202)
     def delete_note(place: Index) -> None:
-        """Delete the note with this place in the state's list."""
+        """Delete a note. `place` is its index in the list of notes in the state."""
         _send(engine, EditNote(place, _note(engine, place), ""))
 
     @router.get("/recordings")
     def recordings() -> list[str]:
-        """The recordings and sessions that can be opened."""
+        """List the recordings and sessions that can be opened."""
         return [str(path) for path in folders.recordings()]
 
     @router.post("/recordings", status_code=202)
     def open_recording(body: OpenBody) -> None:
-        """Open one. The notices in the state say whether that worked."""
+        """Open a recording or session. If this fails, a notice in the state says why."""
         path = folders.openable(body.path)
         _send(engine, protocol.OpenRecording(path, folders.inside(body.truth) if body.truth else truth_beside(path)))
 
@@ -237,25 +240,26 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
         piece: Annotated[bytes, Body(media_type="application/octet-stream")],
         copy: Annotated[str, Query(pattern="^[0-9a-z]{0,16}$")] = "",
     ) -> None:
-        """Copy a recording into the first folder, piece by piece: `offset` bytes of `size` came before this one.
+        """Upload a recording into the first folder, piece by piece.
 
-        `copy` is the same for all pieces and another one for every copy.
+        `offset`: the position of this piece in the file, in bytes. `size`: the size of the whole file, in bytes.
+        `copy`: an identifier of this upload, the same for all its pieces.
         """
         receive(folders, name, offset, size, piece, copy)
 
     @router.delete("/recordings/{name}", status_code=204)
     def discard_upload(name: str) -> None:
-        """Remove the pieces of a copy that was not completed."""
+        """Remove the pieces of an incomplete upload."""
         discard(folders, name)
 
     @router.post("/truth", status_code=202)
     def compare_with(body: CompareBody) -> None:
-        """Compare the trajectory, from its start, with another one."""
+        """Compare the whole trajectory with another one, or end the comparison."""
         _send(engine, protocol.CompareWith(folders.inside(body.path) if body.path else None))
 
     @router.get("/export/{name}", response_class=FileResponse)
     def export(name: ExportName, background: BackgroundTasks) -> FileResponse:
-        """What was processed so far, as `hemislam run` or `hemislam export` writes it."""
+        """Get the results of the frames processed so far, as `hemislam run` or `hemislam export` writes them."""
         if not exporting.acquire(blocking=False):
             raise HTTPException(503, "Too many exports are running; ask again in a moment.")
         try:
@@ -268,7 +272,7 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
 
 def _send(engine: RunningEngine, command: Command) -> None:
     if not engine.snapshot.engine_alive and not isinstance(command, protocol.Restart | protocol.OpenRecording):
-        raise HTTPException(503, "The engine's process has ended; the action `restart` starts it again.")
+        raise HTTPException(503, "The engine's process has ended; send the action `restart` to start it again.")
     engine.send(command)
 
 
@@ -295,7 +299,7 @@ def _exported(engine: RunningEngine, name: str, background: BackgroundTasks) -> 
 
 
 def _save(engine: RunningEngine, folder: Path, formats: tuple[str, ...]) -> None:
-    """Let the engine save into a folder, and wait until it has."""
+    """Tell the engine to save into a folder, and wait until it has finished."""
     snapshot = engine.snapshot
     if snapshot.transport.frame < 0:
         raise HTTPException(409, "No frame has been processed yet; open a recording and play it first.")

@@ -16,17 +16,17 @@ from app.server.access import MOST_BYTES, MOST_OF_MESSAGE
 from app.server.viser_adapter import KEY_HEADER, Viser, is_readable
 
 VIEWER_MESSAGES: Final = frozenset({"ViewerCameraMessage"})
-"""The messages that a view-only page may send to viser: where its own camera is."""
+"""The messages that a view-only page may send to viser: the position of its own camera."""
 NEVER: Final = frozenset({"ShareUrlRequest", "ShareUrlDisconnect"})
-"""The messages that no page may send: they would open viser's public tunnel to this machine."""
+"""Messages that no page may send: they would open viser's public tunnel to this machine."""
 
 PICTURE: Final = "GetRenderResponseMessage"
-"""A picture of the scene that the page was asked for: the only message that may be large."""
+"""A picture of the scene, requested from the page: the only message that may be large."""
 MOST_UPLOADS: Final = 4
 """Most uploads at the same time from one browser."""
 
 BUFFER_BYTES: Final = 1 << 20
-"""Send buffer of each socket on the way to the browser. By default, tens of megabytes of old frames could queue."""
+"""Send buffer of each socket towards the browser. With the default, tens of megabytes of old frames could queue."""
 
 
 NO_MESSAGE: Final = "This is not a message of the page."
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 class Refused(Exception):
-    """A browser sent something that ends its connection. code: to close the WebSocket with."""
+    """A browser sent something that ends its connection. code: the WebSocket's close code."""
 
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)
@@ -50,7 +50,7 @@ class Gate:
         self._uploads: dict[str, int] = {}
 
     def let(self, raw: bytes) -> bytes | None:
-        """The message to pass on, encoded again so that viser reads exactly what was checked; None: leave it out.
+        """The message to pass on, encoded again so that viser reads exactly what was checked; None: drop the message.
 
         Raises:
             Refused: it is not a message, is too large, or belongs to an upload that is too large.
@@ -83,10 +83,10 @@ class Gate:
             self._uploads[str(message.get("transfer_uuid"))] = size
 
     def _take(self, message: dict[str, Any]) -> bool:
-        """Whether a part belongs to an upload. Together the parts must not exceed the announced size."""
+        """Whether a part belongs to an upload. The parts together must not exceed the announced size."""
         name, content = str(message.get("transfer_uuid")), message.get("content")
         if name not in self._uploads or not isinstance(content, bytes) or not content:
-            return False  # empty parts would pile up without limit
+            return False  # empty parts would accumulate without limit
         self._uploads[name] -= len(content)
         if self._uploads[name] < 0:
             raise Refused(1009, "The file is larger than announced.")
@@ -96,11 +96,11 @@ class Gate:
 
 
 async def bridge(browser: WebSocket, target: Viser, *, viewer: bool = False) -> None:
-    """Pass messages between a browser and viser until either of them leaves.
+    """Pass messages between a browser and viser until one of them disconnects.
 
     A message is read after the previous one was delivered, so viser sends a slow browser fewer and newer updates.
     """
-    pipe = socket.socket(proto=socket.IPPROTO_TCP)  # asyncio turns Nagle's algorithm off only if the protocol is named
+    pipe = socket.socket(proto=socket.IPPROTO_TCP)  # asyncio disables Nagle's algorithm only if the protocol is named
     pipe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
     pipe.setblocking(False)
     try:

@@ -1,8 +1,8 @@
-"""Keyframe clouds for display, thinned so that the whole map has no more points than a page can show.
+"""Keyframe clouds for display, thinned so that the whole map fits into the number of points that a page can show.
 
-Every chunk has a level. Level 0 is the chunk as it was made. At each further level it has one point per voxel, and the
+Every chunk has a level. Level 0 is the original chunk. At each further level it has one point per voxel, and the
 edge of the voxels doubles; at the last level it has no points. The map is thinned where this is least noticed. Levels
-never fall: points that were thinned away are gone. The number of clouds is bounded too: where keyframes are close
+never decrease: points that were removed are lost. The number of clouds is limited too: where keyframes are close
 together, one takes over the points of the previous one.
 """
 
@@ -21,14 +21,14 @@ VOXEL_M: Final = 0.05
 """Edge of the voxels of level 0."""
 FINEST_VOXEL_M: Final = 0.08
 COARSEST_LEVEL: Final = 8
-"""At 0.08 m · 2^7 = 10 m a keyframe has only a handful of points left."""
+"""At 0.08 m · 2^7 = 10 m, only a handful of a keyframe's points are left."""
 EMPTY_LEVEL: Final = COARSEST_LEVEL + 1
 MOST_SHOWN: Final = 1000
-"""Most keyframes that have points. Each is a draw call in the page."""
+"""Maximum number of keyframes that have points. Each is one draw call in the page."""
 _BY_POINT: Final = ("points", "labels", "intensity", "ring")
 """Arrays of a chunk and of a keyframe's cloud with one row per point."""
 _SLACK: Final = 0.97
-"""A map over budget is thinned to this share of the budget, so that not every new keyframe thins it again."""
+"""A map over its budget is thinned to this share of the budget, so that not every new keyframe triggers thinning."""
 
 
 def thinned(keyframe: Keyframe) -> Chunk:
@@ -50,7 +50,7 @@ def one_per_voxel(points: F32, voxel_size: float, seed: int = 0) -> I64:
 
 
 def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: int) -> tuple[Chunk, ...]:
-    """The same chunks if they have at most `budget` points; else some of them at higher levels.
+    """The same chunks if they have at most `budget` points; otherwise some of them at higher levels.
 
     Args:
         poses: (k, 4, 4) T_map_imu of at least the keyframes of these chunks. sensor: (3,) m, in the map.
@@ -72,8 +72,8 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
 def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
     """The same chunks, of which at most `MOST_SHOWN` keep points, spread evenly along the trajectory.
 
-    The keyframe whose neighbours are closest to each other gives its points to the later one, so that a seek back never
-    shows points that were not measured yet.
+    The keyframe whose two neighbours are closest to each other gives its points to the later neighbour, so a seek back
+    never shows points that were not measured yet.
     """
     shown = [index for index, chunk in enumerate(chunks) if chunk.level < EMPTY_LEVEL]
     if len(shown) <= MOST_SHOWN:
@@ -104,7 +104,7 @@ def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
 
 
 def as_thin(chunk: Chunk, held: Chunk | None) -> Chunk:
-    """A chunk thinned as often as the one it replaces, so that other keyframes lose no points by a changed label."""
+    """A chunk at the level of the one it replaces, so that a changed label does not cost other keyframes points."""
     while held is not None and chunk.level < held.level:
         chunk = coarser(chunk) if chunk.level < COARSEST_LEVEL else _chosen(chunk, np.empty(0, np.int64), EMPTY_LEVEL)
     return chunk

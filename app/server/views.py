@@ -1,6 +1,6 @@
 """The session's state as the REST interface sends it.
 
-Fields are read by name from the values in `Snapshot`; those with another name or unit there are converted.
+Most fields are copied by name from the values in `Snapshot`; those with another name or unit are converted.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from app.slam.types import StepResult
 
 
 class RestModel(BaseModel):
-    """Numbers that are nan become null: JSON has no nan."""
+    """NaN becomes null, because JSON has no NaN."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -36,9 +36,9 @@ class FrameView(RestModel):
     index: int
     stamp_ns: int
     status: str
-    position: list[float] = Field(description="Of the IMU in the map, m.")
-    quaternion: list[float] = Field(description="x, y, z, w: from the IMU's axes to the map's.")
-    velocity: list[float] = Field(description="m/s, odometry frame.")
+    position: list[float] = Field(description="Position of the IMU in the map, m.")
+    quaternion: list[float] = Field(description="x, y, z, w; rotates from the IMU frame to the map frame.")
+    velocity: list[float] = Field(description="Velocity of the IMU in the odometry frame, m/s.")
     ground_found: bool
     ground_reason: str
     planarity: float | None
@@ -49,29 +49,31 @@ class FrameView(RestModel):
     degenerate: bool
     timings_ms: dict[str, float]
     distance: float | None = Field(description="Length of the trajectory so far, m.")
-    error: float | None = Field(description="To the truth, aligned to the trajectory so far, m.")
+    error: float | None = Field(
+        description="Distance to the truth, m, with the truth aligned to the trajectory so far."
+    )
 
 
 class LoopView(RestModel):
-    """A loop candidate, by keyframes."""
+    """A loop candidate between two keyframes."""
 
     older: int
     newer: int
     verdict: str
     reason: str
     origin: str
-    edited: bool = Field(description="The verdict is the user's.")
+    edited: bool = Field(description="Whether the user decided the verdict.")
     weight: float
-    represented_by: tuple[int, int] | None = Field(description="The loop that is in the graph for both.")
+    represented_by: tuple[int, int] | None = Field(description="The loop that is in the graph in place of this one.")
     repeats: tuple[int, int] | None = Field(
-        description="A loop nearby that measured the same; both tie the keyframes of that one."
+        description="A loop nearby that measured the same; this one adds a measurement between its keyframes."
     )
 
 
 class LoopsState(BaseModel):
     loops: list[LoopView]
-    edits: list[dict[str, Any]] = Field(description="The user's edits, in order, as in a file of edits.")
-    undone: list[dict[str, Any]] = Field(description="Undone edits that can be redone, the next one last.")
+    edits: list[dict[str, Any]] = Field(description="The user's edits in order, in the format of a file of edits.")
+    undone: list[dict[str, Any]] = Field(description="Undone edits that can be redone; the last entry is redone first.")
 
 
 class StateView(RestModel):
