@@ -1,4 +1,4 @@
-"""The controls of how the scene looks, and the legend that explains its colours."""
+"""The controls for the look of the scene, and the legend that explains its colours."""
 
 from typing import Final
 
@@ -10,7 +10,7 @@ from app.ui.scale import Looks
 from app.ui.widgets import View, add_command, choose_next, show
 
 _ACCENTS: Final = {False: (38, 166, 154), True: (13, 110, 102)}
-"""On a dark and on a light background."""
+"""Colours on a dark and on a light background."""
 _LAYERS: Final = (
     ("map", "map", "Points of the keyframes."),
     (
@@ -34,7 +34,7 @@ def apply_theme(gui: viser.GuiApi, *, light: bool) -> None:
 
 
 class AppearancePanel:
-    """Widgets whose values are the `View`; the engine does not know of them.
+    """Widgets whose values form the `View`; the engine does not know about them.
 
     looks: how browsers look at the scene. legend: what `templates/transport.js` copies into the scene.
     """
@@ -43,7 +43,7 @@ class AppearancePanel:
         default = View()
         self._looks = looks
         self._legend = legend
-        self._limits: Limits | None = None  # of all values
+        self._limits: Limits | None = None  # ends of all values
         self._ends: dict[str, Limits] = {}  # by colour mode, as the user chose them
         self._colour_by = gui.add_dropdown(
             "colour by", COLOUR_BY, initial_value=default.colour_by, hint="Meaning of the colours. C: next mode."
@@ -95,16 +95,16 @@ class AppearancePanel:
 
     @property
     def key(self) -> Key:
-        """What the colours mean now."""
+        """What the colours mean at present."""
         return key(self._colour_by.value, self._limits, self._ends.get(self._colour_by.value))
 
     def colour_by(self, mode: str) -> None:
-        """Choose a colour mode, and follow its values again."""
+        """Choose a colour mode, and let the colours span all its values again."""
         self._ends.pop(mode, None)
         show(self._colour_by, mode)
 
     def choose_ends(self, low: int, high: int) -> None:
-        """Spread the colours over a part of all values, in percent; 0 to 100 follows the values again."""
+        """Let the colours span a part of all values, given in percent; with 0 to 100 they span all values again."""
         all_ = self._limits
         if (low, high) == (0, 100):
             self._ends.pop(self._colour_by.value, None)
@@ -113,7 +113,7 @@ class AppearancePanel:
             self._ends[self._colour_by.value] = Limits(all_.low + low * width, all_.low + high * width)
 
     def look_freely(self, client: viser.ClientHandle) -> None:
-        """Stop following, and say so if it was on."""
+        """Stop following the sensor, and notify the user if following was on."""
         if self._follow.value:
             show(self._follow, False)
             client.add_notification("Follow is off", "The view stays here. F follows the sensor again.")
@@ -121,7 +121,7 @@ class AppearancePanel:
     def draw(
         self, view: View, limits: Limits | None, lines: list[tuple[Rgb, str]], points: int, moving: int, budget: int
     ) -> None:
-        """Explain the colours as drawn and say how many points the page holds, and how many are on what moves.
+        """Explain the colours as drawn; say how many points the page holds, and how many lie on moving objects.
 
         lines: colours and names of what else is drawn. While neither map nor scan is, their colours need no key.
         """

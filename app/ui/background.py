@@ -1,4 +1,4 @@
-"""Work of a panel in a process of its own, so that the page stays quick."""
+"""Work of a panel in a process of its own, so that the page stays responsive."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -12,9 +12,9 @@ from app.ui.widgets import add_button, show
 
 
 class Background:
-    """One piece of work at a time, with a bar that shows its share and a button that ends it.
+    """One task at a time, with a progress bar and a button that stops it.
 
-    A text among its messages says why it failed; a number is the share that is done.
+    Among the messages of the task, a text says why it failed, and a number is the share that is done.
 
     Args:
         name, title: as in `Child`. hint: of the button.
@@ -32,7 +32,7 @@ class Background:
         return self._child is not None
 
     def begin(self, main: Callable[..., None], *args: Any) -> None:
-        """Begin, unless another page has."""
+        """Begin, unless another page has begun already."""
         with self._beginning:
             if self.running:
                 return
@@ -45,7 +45,7 @@ class Background:
         show(self._bar, 100 * share)
 
     def messages(self) -> Iterator[Any]:
-        """Those that have come, but for shares; no more once the work was stopped, by whatever thread."""
+        """New messages, except shares. There are none once any thread has stopped the work."""
         while (child := self._child) is not None:
             message = child.news()
             if message is None or child is not self._child:
@@ -56,7 +56,7 @@ class Background:
                 yield message
 
     def stop(self) -> None:
-        """End the work, if there is any."""
+        """Stop the work, if there is any."""
         child, self._child = self._child, None
         self._bar.visible = self._stop.visible = False
         if child is not None:

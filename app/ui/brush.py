@@ -1,4 +1,4 @@
-"""The brush: marks points of the present frame as ground or not, which `ground-f1` then measures labels against."""
+"""The brush marks points of the present frame as ground or not; `ground-f1` then compares labels with these marks."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -23,9 +23,9 @@ from app.ui.widgets import ROOT, Changes, Page, View, add_button, by_user
 _OFF: Final = "off"
 _MARKS: Final = {"ground": GROUND, "not ground": NON_GROUND, "erase": UNMARKED}
 _COLOURS: Final = np.array([(255, 92, 141), LABEL_COLOURS[GROUND]], np.uint8)
-"""Of marks: not ground in pink, ground in teal."""
+"""Colours of marks: not ground in pink, ground in teal."""
 _SCALE: Final = 2.0
-"""Marked points are larger than the others of the scan."""
+"""Marked points are drawn larger than the other points of the scan."""
 
 
 class BrushPanel:
@@ -57,7 +57,7 @@ class BrushPanel:
 
     @property
     def painting(self) -> bool:
-        """Whether clicks in the scene are for the brush."""
+        """Whether the brush takes clicks in the scene."""
         return self._mark is not None
 
     def choose(self, name: str) -> None:
@@ -99,12 +99,12 @@ class BrushPanel:
 
     # --- what is marked --------------------------------------------------------------------------
     def _frame(self) -> StepResult | None:
-        """The present one; None while it plays, or while the brush is off."""
+        """The present frame; None during playback, or while the brush is off."""
         snapshot = self._page.snapshot()
         return None if snapshot.transport.playing or not self.painting else snapshot.result
 
     def clicked(self, event: viser.SceneClickEvent) -> bool:
-        """Take a click in the scene, while the brush is on; whether it was taken."""
+        """Handle a click in the scene if the brush is on. Returns whether it did."""
         if (result := self._frame()) is None:
             return self.painting
         points, index = result.cloud.points, point_at(result, self._page.in_map(event))
@@ -134,7 +134,7 @@ class BrushPanel:
 
     # --- the frames that have marks --------------------------------------------------------------
     def _go(self, word: str, _: viser.ClientHandle) -> None:
-        """What the list sends: "frame 1700000000000000000", a stamp."""
+        """Handle what the list sends: "frame 1700000000000000000", with the frame's stamp."""
         snapshot = self._page.snapshot()
         if snapshot.recording is not None and "stamp_s" in snapshot.series:
             seconds = (int(word.removeprefix("frame ")) - snapshot.recording.start_ns) * 1e-9

@@ -1,7 +1,7 @@
 """Calibrate: find the LiDAR's pose on the IMU from the open recording, in a process of its own, and apply it.
 
-It begins automatically where the mounting is not known, and after a doubtful run. If no mounting was given, the result
-is applied at once, unless the user changed something in the meantime. A session that is continued keeps its parameters.
+It begins automatically if the mounting is unknown, and after a doubtful run. If no mounting was given, the result is
+applied at once, unless the user changed something in the meantime. A resumed session keeps its parameters.
 """
 
 from collections.abc import Callable
@@ -33,11 +33,11 @@ _KEEPS = "Save these parameters beside the recording, so that they apply wheneve
 
 @dataclass(frozen=True, slots=True)
 class FoundMounting:
-    """What the process sends at the end.
+    """The result that the process sends at the end.
 
     Attributes:
         rows: names and values of a table. values: parameters by dotted name. plot: SVG of the residuals.
-        contradiction: what is wrong with the parameters taken so far, in a sentence; "" if nothing is.
+        contradiction: what is wrong with the parameters used so far, in a sentence; "" if nothing is.
     """
 
     rows: list[tuple[str, str]]
@@ -47,11 +47,12 @@ class FoundMounting:
 
 
 class CalibrationPanel:
-    """A button, then the progress, then what was found with its uncertainty, and a button that applies or undoes it.
+    """A button, then the progress, then the result with its uncertainty and a button that applies or undoes it.
 
     Args:
-        unasked: begin without being asked where that helps.
-        resolve: gives the parameters of a recording, with the calibration beside it or, by `calibrated=False`, without.
+        unasked: begin automatically where that helps.
+        resolve: returns the parameters of a recording, with the calibration stored beside it, or without that
+            calibration if `calibrated=False`.
     """
 
     def __init__(self, page: Page, *, unasked: bool = False, resolve: Callable[..., Params] | None = None) -> None:
@@ -64,18 +65,18 @@ class CalibrationPanel:
         self._keep = add_button(gui, "Keep", lambda _: self._write(), hint=_KEEPS, visible=False)
         self._plot = gui.add_html("", visible=False)
         self._found = FoundMounting([], {})
-        self._before: dict[str, Any] = {}  # values that those found replaced; empty unless these are in use
+        self._before: dict[str, Any] = {}  # values that the result replaced; empty while it is not applied
         self._file: bytes | None = None  # the parameter file beside the recording, before it was written
         self._sentence = ""  # for the report, once the values are applied
         self._given = Params()
         self._of: Path | None = None
         self._asked = self._tried = False
-        self._notified: set[int] = set()  # browsers that know what is being looked for
+        self._notified: set[int] = set()  # browsers that were told about the search
         self._heard = 0  # the newest notice when this recording was opened
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording.path if snapshot.recording else None
-        if recording != self._of:  # what was found belongs to another one
+        if recording != self._of:  # the result belongs to another recording
             self.close()
             self._of, self._found, self._before, self._tried = recording, FoundMounting([], {}), {}, not self._unasked
             self._html.visible = self._apply.visible = self._keep.visible = self._plot.visible = False
@@ -91,7 +92,7 @@ class CalibrationPanel:
         self._apply.disabled = self._keep.disabled = self._work.running
 
     def close(self) -> None:
-        """End what is under way."""
+        """Stop a calibration in progress."""
         self._work.stop()
 
     def _show(self, message: Any) -> None:
@@ -110,11 +111,11 @@ class CalibrationPanel:
             self._use_or_advise(found.contradiction)
 
     def _tell(self, *more: tuple[str, str]) -> None:
-        """Show what was found, and what became of it."""
+        """Show the result, and what was done with it."""
         self._html.content, self._html.visible = panel("calibration", [*self._found.rows, *more]), True
 
     def _use_or_advise(self, contradiction: str) -> None:
-        """Use what was found unasked where nothing else is known; elsewhere say how to apply it."""
+        """If no mounting is known, apply a result that nobody asked for; otherwise say how to apply it."""
         snapshot = self._page.snapshot()
         if _is_unknown(snapshot) and snapshot.params == self._given and not _has_edits(snapshot):
             self._use()
@@ -146,7 +147,7 @@ class CalibrationPanel:
             self._show(str(error))
 
     def _uncalibrated(self, recording: Path, params: Params) -> Params:
-        """These parameters without what was found in this recording before; else its walk would count twice."""
+        """These parameters without an earlier result from this recording, which would count the same walk twice."""
         used = params.with_values(self._found.values)
         without = {name: value for name, value in self._before.items() if params.value(name) == used.value(name)}
         if self._resolve is not None and calibrated_beside(recording):
@@ -163,13 +164,13 @@ class CalibrationPanel:
             self._write()
 
     def _use(self) -> None:
-        """Set what was found."""
+        """Apply the result."""
         params = self._page.snapshot().params
         self._before = {name: params.value(name) for name in self._found.values}
         self._set(dict(self._found.values), self._sentence)
 
     def _undo(self) -> None:
-        """Set what was there before, and put the parameter file back as it was."""
+        """Restore the earlier values and the earlier parameter file."""
         self._set(self._before, "")
         self._before = {}
         kept, self._keep.visible = not self._keep.visible, False
@@ -185,7 +186,7 @@ class CalibrationPanel:
                 self._tell(("kept", f"{sidecar(self._of)} cannot be put back ({error.strerror}); delete it"))
 
     def _write(self) -> None:
-        """Keep what was found beside the recording."""
+        """Save the result beside the recording."""
         assert self._of is not None
         path = sidecar(self._of)
         self._keep.visible = False
@@ -198,7 +199,7 @@ class CalibrationPanel:
             self._tell(("not kept", str(error)))
 
     def _set(self, values: dict[str, Any], sentence: str) -> None:
-        """Set parameters, begin anew with them, and go on from the frame that was shown."""
+        """Set parameters, restart with them, and return to the frame that was shown."""
         transport = self._page.snapshot().transport
         self._page.send(SetParams(values))
         self._page.send(Restart())
@@ -214,19 +215,19 @@ class CalibrationPanel:
 
 
 def _is_unknown(snapshot: Snapshot) -> bool:
-    """Whether there is an IMU, and nobody has said where the LiDAR is on it."""
+    """Whether there is an IMU, and the pose of the LiDAR on it was not given."""
     has_imu = snapshot.recording is not None and NO_IMU not in snapshot.recording.findings
     return has_imu and is_mounting_unknown(snapshot.params) and not snapshot.resumed
 
 
 def _has_edits(snapshot: Snapshot) -> bool:
-    """Whether somebody made something that belongs to the frames as they are."""
+    """Whether the user made something that belongs to the present frames."""
     s = snapshot
     return bool(s.notes or s.measures or s.painted or s.views or s.loops.undo)
 
 
 def find(owner: Link, recording: Path, params: Params) -> None:
-    """In a process of its own: sends fractions done, then what was found."""
+    """Run in a process of its own: sends the fraction done, and finally the result."""
     from app.calibration.calibrate import calibrate
     from app.evaluation.plots import residual_plot
 

@@ -1,4 +1,4 @@
-"""Where a browser's camera stands: the whole map, from above or the side, without perspective, and kept views."""
+"""The camera of each browser: views of the whole map, from above or the side, orthographic views, and kept views."""
 
 from collections import deque
 from collections.abc import Callable
@@ -16,19 +16,19 @@ from app.ui.widgets import Changes, Page, add_button, add_command, by_user
 
 FOV: Final = float(np.radians(60.0))
 _NARROW: Final = float(np.radians(2.0))
-"""viser has no parallel projection: from far away, through a narrow lens, lines stay parallel to the eye."""
+"""viser has no orthographic projection; a narrow field of view from far away looks nearly the same."""
 _LENSES: Final = {"perspective": FOV, "orthographic": _NARROW}
 _LEFT_OUT: Final = 0.1
-"""Percent of the points that may lie beyond each edge of a fitted view: few far ones would make the rest small."""
+"""Percent of the points that may lie beyond each edge of a fitted view: a few far points would shrink the rest."""
 _LEAST_M: Final = 4.0
 _SOME: Final = 20_000
-"""Points that say where the map is."""
+"""Points of the map that a view is fitted to."""
 _BAR_PX: Final = 80
-"""Height of the scene's lower edge that the transport covers, until a page has said so."""
+"""Height of the strip at the scene's lower edge that the transport covers, until the page reports it."""
 _FAR: Final = 10.0
-"""Things are drawn up to this many times as far away as the middle of the map."""
+"""The far clipping plane, as a multiple of the distance to the middle of the map."""
 FIT, OBLIQUE, PLAN, TOP, FRONT, SIDE = "fit", "3D", "plan", "top", "front", "side"
-"""To fit is to look from the same side as before."""
+"""FIT keeps the direction of the present view."""
 _WAYS: Final[dict[str, tuple[float, float, float]]] = {
     OBLIQUE: (-0.55, -0.55, 0.75),
     PLAN: (0.0, -1e-3, 1.0),
@@ -36,19 +36,19 @@ _WAYS: Final[dict[str, tuple[float, float, float]]] = {
     FRONT: (0.0, -1.0, 0.05),
     SIDE: (-1.0, 0.0, 0.05),
 }
-"""From the map's middle towards the camera."""
+"""Directions from the map's middle towards the camera."""
 _EASE: Final = 0.2
-"""Share of the way to the newest extent of the map that cameras go per drawing, so that they glide as it grows."""
+"""Share of the way to the newest fitted view that cameras move per drawing, so that they glide as the map grows."""
 _ARRIVED: Final = 0.01
 """A camera that is nearer to its goal than this share of the distance to the map has arrived."""
 _PUT: Final = 300
-"""Places of cameras that are remembered: a slow browser says late where its camera was put."""
+"""How many camera positions are remembered: a slow browser reports late where its camera was put."""
 _FOLLOWED_FROM_M: Final = 25.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stand:
-    """Where a camera is and what it looks at, (3,) each, in the map."""
+    """Position of a camera and the point that it looks at, (3,) each, in the map."""
 
     position: F64
     look_at: F64
@@ -58,7 +58,7 @@ class Stand:
         return float(np.linalg.norm(self.position - self.look_at))
 
     def towards(self, other: "Stand", share: float) -> "Stand":
-        """A part of the way to another one; that one itself where little is left."""
+        """A stand this share of the way to another one, or the other one itself if little is left."""
         ways = other.position - self.position, other.look_at - self.look_at
         if max(float(np.linalg.norm(way)) for way in ways) < _ARRIVED * other.distance:
             return other
@@ -67,10 +67,10 @@ class Stand:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What a browser shows the scene in.
+    """The picture in which a browser shows the scene.
 
     Attributes:
-        fov: rad, of its height. shape: width over height. covered: share of its height that is hidden, at the bottom.
+        fov: rad, vertical field of view. shape: width over height. covered: share of its height hidden at the bottom.
     """
 
     fov: float = FOV
@@ -80,11 +80,11 @@ class Picture:
 
 _MAP: Final = np.eye(3)
 NOTHING: Final[F64] = np.array([0.3, 0.2, -0.6]) + 2.5 * np.array(list(product((-1.0, 1.0), repeat=3)))
-"""Looked at before there is a map: around the sensor."""
+"""Points around the sensor, to look at before there is a map."""
 
 
 def whole(points: F64, way: str = OBLIQUE, picture: Picture = Picture(), axes: F64 = _MAP) -> Stand:
-    """From where (n, 3) points, all but a few, just fill a picture. axes: (3, 3) columns, those of a way."""
+    """The stand from which nearly all of (n, 3) points just fill a picture. axes: (3, 3), to which `way` refers."""
     towards = axes @ _WAYS[way] / np.linalg.norm(_WAYS[way])
     right = np.cross((0.0, 0.0, 1.0), towards)
     right /= np.linalg.norm(right)
@@ -101,7 +101,7 @@ def whole(points: F64, way: str = OBLIQUE, picture: Picture = Picture(), axes: F
 
 
 def _between(across: F64, near: F64, one: float, other: float) -> tuple[float, float]:
-    """Where the axis of a camera is, and how far back the camera, to have points between two edges of its picture.
+    """Position of a camera's axis and the camera's distance, so that points lie between two edges of its picture.
 
     Args:
         across, near: (n,) m, to one side and towards the camera. one, other: tangents of that side's edge and of the
@@ -112,23 +112,23 @@ def _between(across: F64, near: F64, one: float, other: float) -> tuple[float, f
 
 
 class Framing:
-    """Keeps the whole map in the picture of every browser while it grows, until its user looks elsewhere."""
+    """Keeps the whole growing map in the picture of every browser, until its user looks elsewhere."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self.north = np.array([0.0, 1.0])  # in the map, which is up in plans
-        self._ways: dict[int, str] = {}  # from which side browsers look; OBLIQUE unless it was chosen
+        self.north = np.array([0.0, 1.0])  # direction in the map; it points up in plans
+        self._ways: dict[int, str] = {}  # directions from which browsers look; OBLIQUE unless chosen
         self._put: deque[F64] = deque(maxlen=_PUT)
         self._points, self._at_once = NOTHING, False
         self._fitted: dict[tuple[object, ...], Stand] = {}
-        self._stands: dict[int, Stand] = {}  # of browsers, as last shown
+        self._stands: dict[int, Stand] = {}  # of each browser, as last shown
         self._left: set[int] = set()  # browsers whose cameras were sent elsewhere
-        self._covered: dict[int, int] = {}  # pixels of the scenes of browsers
+        self._covered: dict[int, int] = {}  # pixels hidden in each browser's scene
         server.initial_camera.fov = FOV
         self._begin(np.zeros(3))
 
     def see(self, points: F64, *, at_once: bool) -> None:
-        """Take in some points of the map, (n, 3); at_once: it is another map."""
+        """Take some points of the map, (n, 3). at_once: jump, since this is another map."""
         self._points = points[:: len(points) // _SOME + 1] if len(points) else NOTHING
         self._at_once |= at_once
         self._fitted.clear()
@@ -139,7 +139,7 @@ class Framing:
         return frozenset((number, self.picture(client)) for number, client in self._server.get_clients().items())
 
     def draw(self, offset: F64) -> bool:
-        """Move the cameras on; False while they are on their way. offset: (3,) m, of the map in the scene."""
+        """Move the cameras. Returns False while they are on their way. offset: (3,) m, of the map in the scene."""
         at_once, self._at_once = self._at_once, False
         clients = self._server.get_clients()
         moving = False
@@ -154,14 +154,14 @@ class Framing:
         return not moving
 
     def show(self, client: viser.ClientHandle, way: str, offset: F64) -> None:
-        """Let a browser look at the whole map from one side, and keep doing so."""
+        """Let a browser look at the whole map from one side, also as the map grows."""
         if way != FIT:
             self._ways[client.client_id] = way
         self._left.discard(client.client_id)
         self._place(client, self._whole(client), offset)
 
     def leave(self, client: viser.ClientHandle) -> None:
-        """Leave a browser's camera alone: it is sent elsewhere, but a slow browser may still say where it was put."""
+        """Leave a browser's camera alone, since it is sent elsewhere; a slow browser may still report its old place."""
         self._left.add(client.client_id)
 
     def cover(self, client: viser.ClientHandle, pixels: int) -> None:
@@ -169,7 +169,7 @@ class Framing:
         self._covered[client.client_id] = pixels
 
     def picture(self, client: viser.ClientHandle) -> Picture:
-        """What a browser shows the scene in."""
+        """The picture in which a browser shows the scene."""
         camera = client.camera
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
         shape = round(width / height, 2) or 0.01
@@ -186,7 +186,7 @@ class Framing:
                 camera.position, camera.look_at = back, np.zeros(3)
 
     def _begin(self, offset: F64) -> None:
-        """Where pages that open later look from."""
+        """Set the view of pages that open later."""
         stand, camera = self._fit(OBLIQUE, Picture()), self._server.initial_camera
         position = stand.position + offset
         if not self._put or not np.array_equal(position, camera.position):
@@ -197,7 +197,7 @@ class Framing:
         return self._fit(self._ways.get(client.client_id, OBLIQUE), self.picture(client))
 
     def _fit(self, way: str, picture: Picture) -> Stand:
-        """The same object while the map is the same."""
+        """The fitted view: the same object as long as the map is the same."""
         x, y = self.north.tolist()
         key = way, picture, x, y
         if key not in self._fitted:
@@ -217,7 +217,7 @@ class Framing:
 
 
 def move(client: viser.ClientHandle, stand: Stand) -> None:
-    """Put a browser's camera somewhere in the scene, and its clipping planes around what it sees."""
+    """Move a browser's camera in the scene, and set its clipping planes to fit what it sees."""
     camera, distance = client.camera, stand.distance
     with client.atomic():
         camera.far, camera.near = _FAR * max(distance, 100.0), max(distance / 1e4, 0.01)
@@ -228,14 +228,14 @@ class CameraPanel:
     """Buttons that move the camera of the browser they are clicked in.
 
     Args:
-        framing: keeps the whole map in the picture. look_freely: lets the camera be sent elsewhere, and stay there.
+        framing: keeps the whole map in the picture. look_freely: allows the camera to go elsewhere and stay there.
     """
 
     def __init__(self, page: Page, framing: Framing, look_freely: Callable[[viser.ClientHandle], None]) -> None:
         gui = page.gui
         self._page, self._framing, self._look_freely = page, framing, look_freely
         self._changes = Changes()
-        self._made_parallel: set[int] = set()  # browsers whose view lost its perspective by a plan or a section
+        self._made_parallel: set[int] = set()  # browsers that a plan or a section made orthographic
         ways = gui.add_button_group(
             "camera",
             (FIT, *_WAYS),
@@ -255,7 +255,7 @@ class CameraPanel:
         add_command(gui, "Frame the whole map", lambda client: self.look(FIT, client), hotkey="G")
 
     def look(self, way: str, client: viser.ClientHandle) -> None:
-        """Show the whole map from one side, also as it grows."""
+        """Show the whole map from one side, also as the map grows."""
         self._look_freely(client)
         if way == PLAN:
             self._make_parallel(client)
@@ -265,16 +265,16 @@ class CameraPanel:
         self._framing.show(client, way, self._page.offset())
 
     def face(self, client: viser.ClientHandle, middle: F64, size: tuple[float, float], axes: F64 = _MAP) -> None:
-        """Look at something from its front, without perspective.
+        """Look at something from its front, in orthographic view.
 
         Args:
-            middle: (3,) m, map. size: m, width and height. axes: (3, 3), its own, as columns.
+            middle: (3,) m, map. size: m, width and height. axes: (3, 3), the object's own axes as columns.
         """
         self._look_freely(client)
         self._make_parallel(client)
         picture = self._framing.picture(client)
         half = 0.6 * max(size[1] / (1 - picture.covered), size[0] / picture.shape, 1.0)
-        look_at = middle - axes[:, 2] * half * picture.covered  # in the middle of what is not covered
+        look_at = middle - axes[:, 2] * half * picture.covered  # in the middle of the uncovered part
         self._go(client, Stand(look_at - axes[:, 1] * half / np.tan(FOV / 2), look_at))
 
     def _choose_lens(self, name: str, client: viser.ClientHandle) -> None:
@@ -284,13 +284,13 @@ class CameraPanel:
         self._go(client, stand)
 
     def _make_parallel(self, client: viser.ClientHandle) -> None:
-        """Until another side is chosen; where a person chose it, it stays."""
+        """Make the view orthographic until another side is chosen; if the user chose this lens, it stays."""
         if client.camera.fov > FOV / 2:
             self._made_parallel.add(client.client_id)
             client.camera.fov = _NARROW
 
     def _stand(self, client: viser.ClientHandle) -> Stand:
-        """Where the usual lens would show what this camera shows."""
+        """The stand from which the usual lens would show what this camera shows."""
         camera = client.camera
         back = (np.array(camera.position) - camera.look_at) * np.tan(camera.fov / 2) / np.tan(FOV / 2)
         look_at = np.array(camera.look_at) - self._page.offset()
@@ -318,7 +318,7 @@ class CameraPanel:
             self._go(client, Stand(*map(np.array, views[number])))
 
     def _go(self, client: viser.ClientHandle, stand: Stand) -> None:
-        """Move a camera to a stand that is meant for the usual lens."""
+        """Move a camera to a stand given for the usual lens."""
         back = (stand.position - stand.look_at) * np.tan(FOV / 2) / np.tan(client.camera.fov / 2)
         offset = self._page.offset()
         move(client, Stand(stand.look_at + back + offset, stand.look_at + offset))

@@ -1,8 +1,8 @@
 """The growing map: one scene node per keyframe, named by its index.
 
-A keyframe's points are sent once, in its LiDAR frame; when its pose changes later, 7 numbers are sent.
-Of a map larger than the page's budget of points only a part of each keyframe is sent, and again when that part changes
-because someone looks from elsewhere (`parts`). Of a huge map snapshots hold some keyframes with fewer points.
+A keyframe's points are sent once, in its LiDAR frame; when its pose changes later, only 7 numbers are sent.
+If a map is larger than the page's budget of points, only a part of each keyframe is sent; it is sent again when that
+part changes because a camera moves (`parts`). In the snapshot of a huge map, some keyframes already have fewer points.
 """
 
 from collections.abc import Iterator
@@ -27,25 +27,25 @@ from app.ui.shading import light
 from app.ui.widgets import View
 
 _STILL: Final[F32] = np.array([5e-5, 5e-5, 5e-5, STILL_M], np.float32)
-"""Largest change of a pose's rotation and position (m) that is not sent: each loop moves most of the map by less."""
+"""Changes of a pose's rotation and position (m) up to this are not sent; a loop moves most of the map by less."""
 _SIZE_BY_GAP: Final = 0.5
 _GAP_BY_SHARE: Final = 0.25
-"""How gaps grow with the number of points left out: by its square root, but other keyframes fill half of them."""
+"""Exponent by which gaps grow as points are left out: 0.5 for one keyframe, but other keyframes fill half of them."""
 _NO_EYES: Final[F64] = np.zeros((0, 3))
 _NEAR_M: Final = 3.0
 _COARSEST: Final = -12.0
-"""Nearer keyframes are drawn as at this distance, and of each at least this power of two of its points."""
+"""Nearer keyframes are drawn as if at `_NEAR_M`; each keeps at least 2^`_COARSEST` of its points."""
 _AT_ONCE: Final = 300_000
-"""Most points by which known keyframes grow at once: what is nearest comes first."""
+"""Most points that are added to known keyframes at once; the nearest keyframes come first."""
 _SAMPLE: Final = 200
-"""Points of each keyframe that say how large the map is."""
+"""Points of each keyframe from which the extent of the map is found."""
 
 
 def parts(counts: I64, positions: F64, eyes: F64, most: int) -> I64:
-    """(k,) how many of each keyframe's points to draw, at most `most` in all; all of them, if these are no more.
+    """(k,) how many points of each keyframe to draw: all, if these are at most `most`, otherwise at most that many.
 
-    A keyframe twice as far away has a quarter of the points: in the picture they are as dense. Shares are powers of a
-    half, so that few keyframes change as an eye moves.
+    A keyframe twice as far away gets a quarter of the points, which are then equally dense in the picture. Shares are
+    powers of one half, so that few keyframes change as a camera moves.
 
     Args:
         counts: (k,) points of each keyframe. positions: (k, 3) m. eyes: (e, 3) m, where cameras are.
@@ -71,10 +71,10 @@ class _Drawn:
     """A keyframe in the scene.
 
     Attributes:
-        T_map_lidar: where it is drawn. light: (n,) of the chunk's points.
+        T_map_lidar: where it is drawn. light: (n,) brightness of the chunk's points.
         limits: ends of the colour maps with this keyframe and those before it.
-        part: how many of the points may be drawn. shown: (n,) which were sent.
-        handle: None while there are none.
+        part: how many of the points may be drawn. shown: (n,) which points were sent.
+        handle: None while no points are drawn.
     """
 
     chunk: Chunk
@@ -90,7 +90,7 @@ class MapChunks:
     """Draws keyframes below the scene node `root`, with at most `budget` points.
 
     Attributes:
-        settled: whether all that was asked for is drawn. partial: whether the map has more points than are drawn.
+        settled: whether everything wanted is drawn. partial: whether the map has more points than are drawn.
         limits: ends of the colour maps as drawn, by mode.
     """
 
@@ -101,7 +101,7 @@ class MapChunks:
         self._drawn: list[_Drawn] = []
         self._T_map_imu: F64 = np.empty((0, 3, 4))  # of each keyframe, as drawn
         self._view = View()
-        self._look: tuple[object, ...] = ()  # what the colours were chosen by
+        self._look: tuple[object, ...] = ()  # what the colours depend on
         self._fixed: dict[str, Limits] = {}
         self.limits: dict[str, Limits] = {}
         self._start_ns = 0
@@ -115,7 +115,7 @@ class MapChunks:
 
     @property
     def moving(self) -> int:
-        """Points on what moves, shown or not."""
+        """Number of points on moving objects, shown or not."""
         return sum(int(np.count_nonzero(drawn.chunk.labels == MOVING)) for drawn in self._drawn)
 
     def clear(self, start_ns: int, duration_s: float) -> None:
@@ -167,14 +167,14 @@ class MapChunks:
                     drawn.handle.colors = self._drawn_colours(self._shown(drawn))
 
     def _parts(self, chunks: tuple[Chunk, ...], known: int, eyes: F64) -> I64:
-        """(k,) how many points of each to draw now: less at once, more of known ones little by little."""
+        """(k,) how many points of each to draw now. Known keyframes lose points at once and gain them gradually."""
         positions = self._T_map_imu[:, :, 3]
         counts = np.array([len(chunk.points) for chunk in chunks], np.int64)
         self.partial = counts.sum() > self._budget
         wanted = parts(counts, positions, eyes, self._budget)
         before = np.array([drawn.part for drawn in self._drawn[:known]], np.int64)
         growing = np.flatnonzero(wanted[:known] > before)
-        growing = growing[np.argsort(-wanted[growing])]  # those that are near have most
+        growing = growing[np.argsort(-wanted[growing])]  # near keyframes have most
         waiting = growing[1:][np.cumsum(wanted[growing])[1:] > _AT_ONCE]
         wanted[waiting] = before[waiting]
         self.settled = not len(waiting)
@@ -187,7 +187,7 @@ class MapChunks:
         del self._drawn[count:]
 
     def _move(self, poses: F64) -> npt.NDArray[np.bool_]:
-        """Take the (k, 3, 4) poses; which of the keyframes in the scene are to be drawn elsewhere."""
+        """Store the (k, 3, 4) poses. Returns a mask of the keyframes in the scene that moved."""
         now, before = poses.copy(), self._T_map_imu[: len(self._drawn)]
         moved = np.asarray((np.abs(now[: len(before)] - before) > _STILL).any(axis=(1, 2)))
         now[: len(before)][~moved] = before[~moved]
@@ -204,7 +204,7 @@ class MapChunks:
         return limits
 
     def shown(self) -> Iterator[tuple[F64, U8]]:
-        """(n, 3) points of the map that are shown, whether or not the map is, and their (n, 3) colours."""
+        """(n, 3) points chosen for display, even if the map is hidden, and their (n, 3) colours."""
         for drawn in self._drawn:
             cloud = self._shown(drawn)
             yield lie.moved(drawn.T_map_lidar, cloud.points), self._colours(cloud)
@@ -234,8 +234,8 @@ class MapChunks:
     def _send(self, drawn: _Drawn) -> None:
         """Send a keyframe's points in place of those sent before.
 
-        Under the same name instead of through the handle's properties: a page that connects later is
-        then not sent what was thinned away.
+        The node is replaced by name instead of through the handle's properties; otherwise a page that connects later
+        would also be sent the points that were removed.
         """
         drawn.shown = self._chosen(drawn)
         if not drawn.shown.any():  # the page cannot draw a cloud without points
@@ -255,14 +255,14 @@ class MapChunks:
         )
 
     def _size(self, drawn: _Drawn) -> float:
-        """m: points that are far apart, because many are left out, are drawn larger, so that surfaces stay closed."""
+        """Size of the points, m. If many are left out, the others are drawn larger, so that surfaces stay closed."""
         chunk = drawn.chunk
         gap = voxel_of_level(chunk.level) if chunk.level else VOXEL_M
         gap *= float((len(chunk.points) / max(drawn.part, 1)) ** _GAP_BY_SHARE)
         return self._view.map_point_size * max(1.0, _SIZE_BY_GAP * gap / self._view.point_size)
 
     def _drawn_colours(self, cloud: PointSet) -> U8:
-        """(n, 3) colours; one for all, (3,), while the map stands back."""
+        """(n, 3) colours; while the map is dimmed, one colour (3,) for all."""
         return np.array(DIMMED[self._view.light], np.uint8) if self._view.tuning else self._colours(cloud)
 
     def _colours(self, cloud: PointSet) -> U8:
@@ -279,10 +279,10 @@ def shown_points(
     *,
     moving: bool = True,
 ) -> npt.NDArray[np.bool_]:
-    """Which points of a chunk are drawn: with or without the ceiling above them, only those in the box.
+    """Mask of the points of a chunk that are drawn, with or without its ceiling, and only inside the box.
 
     Args:
-        part: of how many from the first on; None: of all. moving: with those on what moves.
+        part: use only this many points, from the first on; None: all. moving: include points on moving objects.
     """
     mask = np.arange(len(chunk.points)) < (len(chunk.points) if part is None else part)
     if not ceilings:
@@ -295,7 +295,7 @@ def shown_points(
 
 
 def _same(drawn: Chunk, chunk: Chunk) -> bool:
-    """Whether one is the other, or what it has become: thinned, relabelled, or with another keyframe's points added."""
+    """Whether it is the same chunk or its later state: thinned, relabelled, or joined with another keyframe."""
     if drawn is chunk:
         return True
     return (drawn.index, drawn.frame, drawn.stamp_ns) == (chunk.index, chunk.frame, chunk.stamp_ns) and (

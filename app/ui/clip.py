@@ -1,4 +1,4 @@
-"""The clip box with its handles, sections that are cut by two clicks, and the profile along the walk."""
+"""The clip box with its handles, sections cut by two clicks, and the profile along the walk."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,15 +28,15 @@ _COLOUR: Final = (255, 205, 80)
 _HANDLE_PX: Final = 70.0
 _FAR_M: Final = 1e5
 _MIDDLE: Final = -1
-"""Number of the handle in the middle; the others are those of `FACES`."""
+"""Number of the handle in the middle; the other handles are numbered as in `FACES`."""
 
 
 class ClipPanel:
     """Widgets in the caller's container; the box and its handles in the scene, below the map's node.
 
     Args:
-        measure: takes the clicks by which a section is cut. around: gives (n, 3) some points of the map.
-        ask_where: asks where to save a format.
+        measure: takes the clicks that cut a section. around: returns (n, 3) some points of the map.
+        ask_where: asks where to save a file of a format.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class ClipPanel:
         self._page, self._measure, self._camera, self._around = page, measure, camera, around
         self._scene_changes = Changes()
         self._shown: Clip | None = None  # what the widgets were last set to
-        self._dragged: Box | None = None  # the box as a handle has set it, until the session stores it
+        self._dragged: Box | None = None  # the box as set by a handle, until the session stores it
         self._held: int | None = None  # the browser that holds a handle
         self._session = -1
         self._lines: viser.LineSegmentsHandle | None = None
@@ -65,7 +65,7 @@ class ClipPanel:
             )
             self._size = limited(gui.add_vector3("size (m)", (1.0,) * 3, min=(0.05,) * 3, max=(_FAR_M,) * 3, step=0.05))
             self._turn = limited(gui.add_number("turn (°)", 0.0, min=-360.0, max=360.0, step=1.0))
-            self._turn.precision = 2  # viser would take it from the step, and cut 12.5 to 12
+            self._turn.precision = 2  # by default viser takes it from the step, which turns 12.5 into 12
             self._pull = gui.add_checkbox(
                 "handles", True, hint="The arrows move the sides; the handle in the middle moves the box."
             )
@@ -101,10 +101,10 @@ class ClipPanel:
         return replace(view, clip=clip.hiding)
 
     def draw(self, current: Snapshot) -> None:
-        """Show the box of the session; while a handle is held, the box as dragged."""
+        """Show the session's box, or the dragged box while a handle is held."""
         clip = current.clip
         if self._held is not None and self._held not in self._page.server.get_clients():
-            self._held = self._dragged = None  # a browser that is gone lets nothing go
+            self._held = self._dragged = None  # a browser that has left reports no release
         if clip != self._shown:
             self._shown, self._dragged = clip, None
             self._show(clip)
@@ -130,7 +130,7 @@ class ClipPanel:
         self._send(on=on, **box)
 
     def _whole(self) -> Box:
-        """The box around all of the map but a few far points. Raises HemislamError: there is no map yet."""
+        """The box around the map without a few far points. Raises HemislamError: there is no map yet."""
         points = self._around()
         if not len(points):
             raise HemislamError("There is no map yet to clip; play the recording first.")
@@ -151,7 +151,7 @@ class ClipPanel:
             show(self._turn, round(clip.box.turn, 2))
 
     def look(self, client: viser.ClientHandle) -> None:
-        """Look at the box from its front, without perspective."""
+        """Look at the box from its front, in orthographic view."""
         if (box := self._page.snapshot().clip.box) is not None:
             self._face(client, box)
 
@@ -159,7 +159,7 @@ class ClipPanel:
         self._camera.face(client, box.middle, (box.size[0], box.size[2]), box.axes)
 
     def _unroll(self, on: bool, client: viser.ClientHandle) -> None:
-        """Show the profile and look at all of it, or at the whole map again."""
+        """Show the whole profile, or the whole map again."""
         trajectory, points = self._page.snapshot().trajectory, self._around()
         try:
             path = strides(trajectory[:, :2])
@@ -167,7 +167,7 @@ class ClipPanel:
             show(self._unrolled, False)
             raise
         if on:
-            self._send(unrolled=True, on=False)  # a section's box would leave little of it
+            self._send(unrolled=True, on=False)  # a section's box would hide most of it
             length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
             low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
             self._camera.face(client, np.array([length / 2, 0.0, (low + high) / 2]), (length, high - low))
@@ -203,7 +203,7 @@ class ClipPanel:
             for gizmo in self._handles.values():
                 gizmo.remove()
             self._handles.clear()
-            self._held = self._dragged = None  # no browser tells that it lets go of what is gone
+            self._held = self._dragged = None  # no browser reports the release of a removed handle
         if box is None:
             if self._lines is not None:
                 self._lines.remove()
@@ -239,7 +239,7 @@ class ClipPanel:
             self._handles[number] = gizmo
 
     def _noting(self, number: int) -> Callable[[Any], Any]:
-        """A callback for a handle. A coroutine, since viser keeps their order."""
+        """A callback for a handle: a coroutine, since viser calls coroutines in order."""
 
         async def moved(event: viser.TransformControlsEvent) -> None:
             box = self._page.snapshot().clip.box

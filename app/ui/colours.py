@@ -1,4 +1,4 @@
-"""Colours of points: by label, or by a number through a perceptually uniform map. `MODES` declares every mode."""
+"""Colours of points: by label, or by a number through a perceptually uniform colour map. `MODES` declares the modes."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -19,20 +19,20 @@ LABEL_COLOURS: Final[dict[int, Rgb]] = {
     SEED: (255, 205, 80),
     MOVING: (214, 62, 104),
 }
-"""Blue-grey, teal, amber and crimson: every kind of colour vision tells them apart, and so does lightness alone."""
+"""Blue-grey, teal, amber and crimson: distinct for every kind of colour vision, and by lightness alone."""
 
 LABEL_NAMES: Final[dict[int, str]] = {GROUND: "ground", NON_GROUND: "not ground", SEED: "seed", MOVING: "moving"}
 
 _ANCHORS: Final[dict[str, str]] = {
     # Evenly spaced colours of matplotlib's maps (CC0, van der Walt and Smith), which are uniform in CAM02-UCS.
-    # Their dark ends are left out: they would vanish on the dark page.
+    # Their dark ends are left out because they would be invisible on the dark page.
     "viridis": "3b518b 2c718e 21908d 27ad81 5cc863 aadc32 fde725",
     "plasma": "7e03a8 a92395 cc4778 e56b5d f89540 fdc527 f0f921",
     "cividis": "3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
     "magma": "812581 b5367a e55964 fb8761 fec287 fcfdbf",
-    # From behind to in front, grey between them: seen on a dark and on a light page.
+    # From behind to in front, with grey between: visible on a dark and on a light page.
     "sides": "2f62d9 5f8ae0 94aed8 b0b4ba d9a58c d9704f c8321f",
-    # Neighbours in the list of keyframes get colours far apart.
+    # Successive keyframes get very different colours.
     "wheel": "e0564f d9913a c9c23c 6cc24a 3fc1a5 4aa3dc 6f74e0 b565d9 e0569a e0564f",
 }
 
@@ -45,12 +45,12 @@ def _table(anchors: str) -> U8:
 
 
 TABLES: Final[dict[str, U8]] = {name: _table(anchors) for name, anchors in _ANCHORS.items()}
-"""(256, 3) uint8 per map, from the lowest value to the highest."""
+"""(256, 3) uint8 per colour map, from the lowest value to the highest."""
 
 NOTHING: Final[Rgb] = (92, 100, 114)
-"""Of points without a number."""
+"""Colour of points without a number."""
 DIMMED: Final[dict[bool, Rgb]] = {False: (52, 57, 66), True: (206, 211, 218)}
-"""Of the map while it stands back behind the scan, on a dark and on a light background."""
+"""Colour of the map while it is dimmed behind the scan, on a dark and on a light background."""
 _LABEL_TABLE: Final[U8] = np.array([LABEL_COLOURS[label] for label in range(len(LABEL_COLOURS))], dtype=np.uint8)
 
 
@@ -64,12 +64,12 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSet:
-    """What a colour mode may colour points by.
+    """The values from which a colour mode may take the colours of points.
 
     Attributes:
         points: (n, 3) m, LiDAR frame. labels, intensity, ring: (n,). T_map_lidar: (4, 4).
-        seconds: of the scan, since the recording's start. light: (n,) brightness up to 1, or None.
-        keyframe: its index, or -1. numbers: (n,) what `app.ui.map_numbers` knows of the points, or None.
+        seconds: time of the scan since the recording's start. light: (n,) brightness up to 1, or None.
+        keyframe: its index, or -1. numbers: (n,) values of the points from `app.ui.map_numbers`, or None.
     """
 
     points: F32
@@ -94,9 +94,9 @@ class ColourMode:
     """One way to colour points.
 
     Attributes:
-        legend: the unit, or what the numbers mean. table: of `TABLES`.
-        values: (n,) the number of each point. step: limits that are read from the data grow by it, so that the map is
-            rarely coloured again. share: percent of the values that the limits leave out at each end.
+        legend: the unit, or what the numbers mean. table: a name in `TABLES`.
+        values: (n,) the number of each point. step: limits read from the data grow in such steps, so that the map is
+            rarely recoloured. share: percent of the values beyond the limits at each end.
         fixed: limits known beforehand, from the recording's duration in s; None: read from the data.
         of_map: a point's number depends on the whole map (`app.ui.map_numbers`).
     """
@@ -120,7 +120,7 @@ def _numbers(cloud: PointSet) -> F32:
 
 
 def _own_colour(cloud: PointSet) -> F64:
-    """Far from that of the keyframes before and after: the golden ratio is the worst to approximate by fractions."""
+    """Steps by the golden ratio, which fractions approximate worst: neighbours get very different colours."""
     return np.full(len(cloud.points), cloud.keyframe * 0.618034 % 1.0 if cloud.keyframe >= 0 else np.nan)
 
 
@@ -132,13 +132,13 @@ DENSITY: Final = "density"
 DISTANCE: Final = "distance"
 KEYFRAME: Final = "keyframe"
 LOOK: Final = "height × intensity"
-"""The usual mode: colour by height, brightness by intensity, and the labels as a tint."""
+"""The default mode: colour by height, brightness by intensity, and the labels as a tint."""
 BY_POSE: Final = (HEIGHT, LOOK)
-"""The modes whose colours change when a pose does."""
+"""The modes whose colours depend on the keyframe's pose."""
 _TINTS: Final = np.array([0.0, 0.35, 0.35, 0.8])
-"""How much of its label's colour a point takes."""
+"""By label: the share of the label's colour in a point's colour."""
 _DIMMEST: Final = 0.75
-"""Brightness of the least intensity."""
+"""Brightness at the lowest intensity."""
 
 MODES: Final[dict[str, ColourMode]] = {
     mode.name: mode
@@ -159,7 +159,7 @@ MODES: Final[dict[str, ColourMode]] = {
         ColourMode(DISTANCE, "m in front", "sides", _numbers, of_map=True),
     )
 }
-"""Every other mode, in the order shown."""
+"""Every mode except `LABEL`, in the order shown."""
 
 COLOUR_BY: Final = (LOOK, LABEL, *(name for name in MODES if name != LOOK))
 
@@ -178,7 +178,7 @@ def colours(cloud: PointSet, by: str, limits: Mapping[str, Limits]) -> U8:
 
 
 def _tinted(values: U8, labels: U8, cloud: PointSet, limits: Limits) -> U8:
-    """(n, 3) colours by height, as bright as their intensity, with a tint of their labels' colours."""
+    """(n, 3) colours by height, with brightness by intensity and a tint by label."""
     share = np.clip((cloud.intensity - limits.low) / (limits.high - limits.low), 0.0, 1.0)
     found = values * (_DIMMEST + (1 - _DIMMEST) * np.nan_to_num(share))[:, None]
     tint = _TINTS[_known(cloud.labels)][:, None]
@@ -206,7 +206,7 @@ def value_colours(values: npt.ArrayLike, limits: Limits, table: U8) -> U8:
 def grown(limits: Limits | None, mode: ColourMode, values: npt.ArrayLike) -> Limits | None:
     """`limits` widened to hold nearly all of `values`, rounded outwards.
 
-    Limits never shrink: a colour that a user has learnt to read keeps its meaning.
+    Limits never shrink, so that a colour keeps its meaning for the user.
     """
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
@@ -229,8 +229,8 @@ class Key:
     """What colours mean.
 
     Attributes:
-        stops: (k, 3) from the value `low` to `high`, of `what`; none where colours stand for no numbers.
-        names: of single colours.
+        stops: (k, 3) colours of `what`, from the value `low` to `high`; empty if colours do not stand for numbers.
+        names: single colours and their names.
     """
 
     stops: U8 = field(default_factory=lambda: np.empty((0, 3), np.uint8))
@@ -241,7 +241,7 @@ class Key:
 
 
 def key(by: str, limits: Limits | None, ends: Limits | None = None) -> Key:
-    """What the colours mean. limits: of all values, None before there are any. ends: as chosen by the user."""
+    """What the colours mean. limits: of all values; None before there are any. ends: chosen by the user."""
     names = tuple((LABEL_COLOURS[label], name) for label, name in LABEL_NAMES.items()) if by in (LABEL, LOOK) else ()
     if by == LABEL:
         return Key(names=names)
@@ -251,7 +251,7 @@ def key(by: str, limits: Limits | None, ends: Limits | None = None) -> Key:
 
 
 def legend(by: str, limits: Limits | None, ends: Limits | None = None) -> str:
-    """HTML of the key, with the same arguments. The ends of its bar can be dragged."""
+    """The key as HTML; arguments as for `key`. The ends of its bar can be dragged."""
     found = key(by, limits, ends)
     names, stops = panel("keys", found.names) if found.names else "", found.stops[::32]
     if not len(stops):

@@ -1,6 +1,6 @@
-"""Two settings side by side: fork the session, see what differs, then swap, keep or discard.
+"""Two settings side by side: fork the session, see the differences, then swap, keep or discard.
 
-`Sides` decides which of the two the parameters belong to; `ComparePanel` shows both.
+`Sides` decides whether the parameter panel belongs to A or to B; `ComparePanel` shows both.
 """
 
 from collections.abc import Callable
@@ -36,13 +36,13 @@ from app.ui.widgets import (
 )
 
 _RECENT: Final = 16
-"""Frames of A that are kept until B reaches them."""
+"""How many frames of A are kept until B reaches them."""
 _SWAP, _KEEP, _DISCARD = "swap", "keep", "discard"
 _NO_POINTS: Final[U8] = np.empty(0, dtype=np.uint8)
 
 
 class Sides:
-    """The choice of whose parameters are shown and set; hidden while there is no fork."""
+    """The choice between the parameters of A and of B; hidden while there is no fork."""
 
     def __init__(self, gui: viser.GuiApi, forks: Workspace) -> None:
         self._forks = forks
@@ -82,7 +82,7 @@ class Sides:
 
 
 class CompareScene:
-    """B's trajectory and sensor, and A's scan coloured by who calls its points ground; below the map's node."""
+    """B's trajectory and sensor, and A's scan coloured by which of A and B label a point ground; in the map's frame."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._path = TrajectoryNode(scene, f"{ROOT}/compare_path", maths.B_COLOUR)
@@ -98,14 +98,14 @@ class CompareScene:
         self._cloud = add_points(scene, f"{ROOT}/compare_lidar/scan", NO_POINTS, NO_COLOURS, 0.04)
 
     def draw_b(self, positions: F64, at: F64 | None, visible: bool) -> None:
-        """B's trajectory since the fork, (n, 3), and where its sensor is, (3,); None hides it."""
+        """Draw B's trajectory since the fork, (n, 3), and its sensor at (3,); None hides the sensor."""
         self._path.draw(positions, visible)
         self._marker.visible = visible and at is not None
         if at is not None:
             self._marker.position = at
 
     def draw_ground(self, result: StepResult | None, ground: U8, size: float) -> None:
-        """A's frame, its points coloured by (n,) `Labelled`; None hides it."""
+        """Draw A's frame with its points coloured by (n,) `Labelled`; None hides it."""
         self._lidar.visible = result is not None
         if result is None:
             return
@@ -117,7 +117,7 @@ class CompareScene:
 
 
 class ComparePanel:
-    """Everything about the fork in the caller's container, and what differs in space.
+    """Everything about the fork in the caller's container, and the differences in the scene.
 
     Args:
         sides: shows which side a new fork's parameters are on.
@@ -169,11 +169,11 @@ class ComparePanel:
                 self._plots.append((titled, chart(gui, (np.zeros(1),) * (1 + len(lines)), lines)))
 
     def seen(self, view: View) -> View:
-        """The view without the scan, while it is drawn here in other colours."""
+        """The view; without the scan while this panel draws it in other colours."""
         return replace(view, scan=False) if self._covering else view
 
     def draw(self, a: Snapshot, view: View) -> None:
-        """Called by the drawing thread, often, with the view that all other panels leave."""
+        """Called often by the drawing thread, with the view after all other panels have changed it."""
         b = self._forks.other
         self._sides.draw(b)
         self._fork.visible = self._open.visible = b is None
@@ -208,7 +208,7 @@ class ComparePanel:
         self._scene.draw_ground(pair[0] if pair and self._covering else None, self._ground, view.point_size)
 
     def _matching(self, a: Snapshot, b: Snapshot) -> tuple[StepResult, StepResult] | None:
-        """The newest frame that both have: A's present one, or one of a moment ago while it plays."""
+        """The newest frame that both have: A's present frame or, during playback, a recent one."""
         if b.result is None:
             return None
         ours = self._recent.get((a.session, b.result.index))
@@ -244,7 +244,7 @@ class ComparePanel:
 
     def _swap(self) -> None:
         self._forks.swap()
-        show(self._name, self._forks.names[1])  # B is what `keep` keeps
+        show(self._name, self._forks.names[1])  # `keep` keeps B
 
     def _begin(self) -> None:
         self._forks.fork(self._name.value)
@@ -264,9 +264,9 @@ class ComparePanel:
 
 
 def _curves(found: maths.Difference) -> "list[tuple[Any, ...] | None]":
-    """Of the plots in their order; None for one that has nothing to show."""
+    """The data of the plots, in their order; None for a plot without data."""
     (ms_a, ms_b), (error_a, error_b) = found.total_ms, found.error_m
-    if len(found):  # the first frames' peaks would flatten all others
+    if len(found):  # the peaks of the first frames would flatten the rest
         most = 4 * np.nanmedian(np.concatenate(found.total_ms))
         ms_a, ms_b = np.minimum(ms_a, most), np.minimum(ms_b, most)
     columns = [(100 * found.position_m,), (found.turn_deg,), (ms_a, ms_b), (100 * error_a, 100 * error_b)]

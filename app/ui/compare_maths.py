@@ -1,4 +1,4 @@
-"""What differs between two runs of one recording, in numbers and in words: pure functions on snapshots and clouds."""
+"""Differences between two runs of one recording, in numbers and words: pure functions on snapshots and clouds."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -17,14 +17,14 @@ from app.ui.transport import working
 
 A_COLOUR: Final[Rgb] = PATH_COLOUR
 B_COLOUR: Final[Rgb] = (77, 163, 255)
-"""Pink and blue: every kind of colour vision tells them apart, and from the labels' teal and amber."""
+"""Pink and blue: distinct for every kind of colour vision, also from the labels' teal and amber."""
 
 COLUMNS: Final = 600
-"""Most values of a plot; where frames share one, the largest is shown."""
+"""Most values in a plot; if several frames share one, the largest is shown."""
 
 
 class Labelled(IntEnum):
-    """Who calls a point ground. ALONE: the point is in one of the two clouds only."""
+    """Which of A and B label a point ground. ALONE: the point is in one of the two clouds only."""
 
     NEITHER = 0
     BOTH = 1
@@ -41,12 +41,13 @@ GROUND_COLOURS: Final[U8] = np.array(
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Of the frames that both runs have, from the fork on.
+    """Differences in the frames that both runs have, from the fork on.
 
     Attributes:
-        stamps_s: since the start of the recording. position_m: between the positions before the maps were levelled;
-            both start at the same pose, so nothing is aligned. turn_deg: between the orientations in odom.
-        total_ms, error_m: of A and of B; the error is nan without truth.
+        stamps_s: since the start of the recording. position_m: distance between the positions before the maps were
+            levelled; both start at the same pose, so nothing is aligned. turn_deg: angle between the orientations in
+            odom.
+        total_ms, error_m: of A and of B; the error is NaN without truth.
     """
 
     stamps_s: F64
@@ -60,13 +61,13 @@ class Difference:
 
 
 def common_frames(a: F64, b: F64) -> tuple[I64, I64]:
-    """Indices into two ascending series of stamps at which they hold the same ones."""
+    """Indices of the common stamps in two ascending series."""
     _, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
     return in_a, in_b
 
 
 def difference(a: Snapshot, b: Snapshot, since: int) -> Difference:
-    """What differs between two runs of one recording from a frame of A on."""
+    """The differences between two runs of one recording, from a frame of A on."""
     if "stamp_s" not in a.series or "stamp_s" not in b.series:
         nothing = np.empty(0)
         return Difference(nothing, nothing, nothing, (nothing, nothing), (nothing, nothing))
@@ -82,7 +83,7 @@ def difference(a: Snapshot, b: Snapshot, since: int) -> Difference:
 
 
 def _positions(snapshot: Snapshot) -> F64:
-    """(n, 3) m, where it was before one turn levelled the whole map, as happens to the run that ends first."""
+    """(n, 3) m, the trajectory before one rotation levelled the whole map, which happens first to the run that ends."""
     turns = snapshot.adjustment.T_map_odom
     return lie.moved(lie.inverse(turns[0]), snapshot.trajectory) if len(turns) == 1 else snapshot.trajectory
 
@@ -92,7 +93,7 @@ def _turns(snapshot: Snapshot) -> F64:
 
 
 def turn(a: F64, b: F64) -> F64:
-    """Angles (deg) between orientations given as (n, 3) rotation vectors; nan where one is."""
+    """Angles (deg) between orientations given as (n, 3) rotation vectors; NaN where either is NaN."""
     angles = np.full(len(a), np.nan)
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     between = np.swapaxes(lie.exp(a[known]), -1, -2) @ lie.exp(b[known])
@@ -101,7 +102,7 @@ def turn(a: F64, b: F64) -> F64:
 
 
 def ground_difference(a: Cloud, b: Cloud) -> U8:
-    """(n,) `Labelled` of the points of `a`, found in `b` by the moment and line at which they were measured."""
+    """(n,) `Labelled` of the points of `a`, matched to those of `b` by measurement time and scan line."""
     found = np.full(len(a), Labelled.ALONE, dtype=np.uint8)
     if len(a) == len(b) and np.array_equal(a.offsets_ns, b.offsets_ns) and np.array_equal(a.ring, b.ring):
         in_a = in_b = np.arange(len(a))
@@ -121,7 +122,7 @@ def _moments(cloud: Cloud) -> I64:
 
 
 def thinned(stamps: F64, *columns: F64) -> tuple[F64, ...]:
-    """Stamps and columns with at most `COLUMNS` values each; those with a nan in any column are left out."""
+    """Stamps and columns with at most `COLUMNS` values each; rows with a NaN in any column are left out."""
     known = np.isfinite(stamps) & np.all([np.isfinite(column) for column in columns], axis=0)
     stamps, columns = stamps[known], tuple(column[known] for column in columns)
     if not len(stamps):
@@ -132,14 +133,14 @@ def thinned(stamps: F64, *columns: F64) -> tuple[F64, ...]:
 
 # --- words ---------------------------------------------------------------------------------------
 def status(a: Snapshot, b: Snapshot | None, names: tuple[str, str], forked_at: int) -> str:
-    """Who A and B are, and how B is doing; without a fork, what one is for."""
+    """The names of A and B and the state of B; without a fork, what a fork is for."""
     if b is None:
         return panel("no_fork", a.live is not None)
     return panel("fork", names, forked_at, (A_COLOUR, B_COLOUR), *how(a, b))
 
 
 def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
-    """How B is doing, in a sentence, and its colour."""
+    """The state of B in a sentence, and its colour."""
     if not b.engine_alive:
         return "B's engine has stopped; A is not affected. Keep what B has, or discard it.", BAD
     if b.progress is not None:
@@ -149,7 +150,7 @@ def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
     if not same_recording(a, b):
         return "A has opened another recording; B stays at its frame.", WARN
     behind = a.transport.frame - b.transport.frame
-    unsaved = {saved.error for saved in b.saved}  # a save that failed is no trouble of B's
+    unsaved = {saved.error for saved in b.saved}  # a failed save does not count as B's trouble
     errors = [one.text for one in b.notices if one.level == "error" and one.text not in unsaved]
     trouble = errors[-1] if errors else ""
     if abs(behind) > 1:
@@ -163,10 +164,10 @@ def legend() -> str:
 
 
 def numbers(found: Difference, counts: I64 | None) -> str:
-    """The newest common frame: how far apart, whose ground, how long and how wrong.
+    """Tiles for the newest common frame: distance, ground labels, frame times and errors.
 
     Args:
-        counts: points by `Labelled`; None while there is no frame that both have.
+        counts: points by `Labelled`; None while there is no common frame.
     """
     if not len(found):
         return ""

@@ -1,4 +1,4 @@
-"""The corner, edge or surface that a click near it means: where the planes around it meet."""
+"""Snap a click to the corner, edge or surface near it: the place where the planes around it meet."""
 
 from dataclasses import replace
 from typing import Final
@@ -13,20 +13,20 @@ from app.slam.types import F64
 from app.ui.measure_maths import around
 
 _AROUND_M: Final = 0.6
-"""Planes are looked for within this distance of a spot."""
+"""Radius around a spot within which planes are searched for."""
 _MOVED_M: Final = 0.4
 """Largest distance that a spot is moved."""
 _THICK_M: Final = 0.02
-"""Points this near a plane belong to it."""
+"""Points within this distance of a plane belong to it."""
 _FEWEST, _LEAST_SHARE = 15, 0.05
-"""Points, and share of all there, that a plane needs."""
+"""A plane needs at least this many points, and this share of all points around the spot."""
 _TRIALS, _MOST_POINTS, _MOST = 300, 3000, 5
 _APART: Final = float(np.sin(np.radians(25.0)))
-"""Planes at a smaller angle do not determine well where they meet."""
+"""Sine of the smallest angle between planes; at a smaller angle, their intersection is poorly determined."""
 
 
 def snapped(chunks: tuple[Chunk, ...], poses: F64, spot: Spot) -> Spot:
-    """The spot moved to the corner near it, else to the edge, else onto the surface; itself where none is near.
+    """The spot moved to the nearest corner, else to an edge, else onto a surface; unchanged if none is near.
 
     Args:
         poses: (k, 4, 4) T_map_imu of the chunks' keyframes.
@@ -38,7 +38,7 @@ def snapped(chunks: tuple[Chunk, ...], poses: F64, spot: Spot) -> Spot:
 
 
 def meeting(points: F64) -> F64:
-    """(3,) m, the place nearest to the origin where planes through (n, 3) points meet; 0 if none is near."""
+    """(3,) m, the place nearest to the origin where planes through (n, 3) points meet; 0 if there is none nearby."""
     normals, heights = planes(points)
     for count in (3, 2, 1):
         chosen = _apart(normals, count)
@@ -50,7 +50,7 @@ def meeting(points: F64) -> F64:
 
 
 def _apart(normals: F64, count: int) -> list[int]:
-    """The first planes, at most `count`, that are each at a good angle to what those before have in common."""
+    """The first planes, at most `count`, whose normals are well away from the span of the normals chosen before."""
     chosen: list[int] = []
     for k in range(len(normals)):
         if len(chosen) < count:
@@ -65,9 +65,9 @@ def _apart(normals: F64, count: int) -> list[int]:
 
 
 def planes(points: F64) -> tuple[F64, F64]:
-    """Of (n, 3) points the planes with most of them, one after the other: normals (k, 3) and heights (k,) m.
+    """The planes with the most of (n, 3) points, found one after the other: normals (k, 3) and heights (k,) m.
 
-    By random samples of three (Fischler and Bolles 1981), then least squares on the points that are of one plane only.
+    Found by RANSAC (Fischler and Bolles 1981), then fitted by least squares to the points that lie on one plane only.
     """
     rng = np.random.default_rng(0)
     if len(points) > _MOST_POINTS:
@@ -101,5 +101,5 @@ def _fitted(points: F64) -> tuple[F64, float]:
 
 
 def _near(points: F64, found: list[tuple[F64, float]]) -> npt.NDArray[np.bool_]:
-    """(n, k), which of (n, 3) points belong to which plane."""
+    """(n, k) mask: which of (n, 3) points belong to which plane."""
     return np.stack([np.abs(points @ normal - height) < _THICK_M for normal, height in found], axis=1)

@@ -25,12 +25,12 @@ from app.ui.widgets import Changes, Page, add_button, by_user, dialog, limited
 _MOST_ENTRIES: Final = 60
 _RECENT: Final = 3
 _LONGEST_NAME: Final = 200
-"""Bytes; file systems take 255."""
+"""Bytes; file systems allow 255."""
 _OF_A_RUN: Final = "all of a run"
 
 
 def _titles() -> dict[str, str]:
-    """Formats by what the page calls them: their files and what these hold."""
+    """Formats by their title on the page, which lists their files and contents."""
     found: dict[str, str] = {}
     for name in FORMATS:
         first, *more = [export for export in EXPORTS if export.format == name]
@@ -43,7 +43,7 @@ _FORMATS: Final = _titles()
 
 
 def size_text(size: int) -> str:
-    """Bytes in the unit a person would choose."""
+    """A number of bytes in a suitable unit."""
     value = float(size)
     for unit in ("B", "kB", "MB"):
         if value < 1000:
@@ -59,12 +59,12 @@ def result_folder_name(recording: Path, now: datetime) -> str:
 
 
 def last_saved(snapshot: Snapshot) -> Path | None:
-    """The folder of the results that were saved last, and stay."""
+    """The folder of the newest results that were saved without an error and stay on the disk."""
     return next((one.folder for one in reversed(snapshot.saved) if not (one.error or one.fetched)), None)
 
 
 def folder_name(typed: str) -> str:
-    """What was typed as the name of a folder for results. Raises HemislamError: it cannot be one."""
+    """Check a typed name of a results folder. Raises HemislamError: the name cannot be used."""
     name = typed.strip()
     if not name or Path(name).name != name or name.startswith(".") or not name.isprintable():
         raise HemislamError("The folder needs a name without / that does not begin with a dot.")
@@ -74,7 +74,7 @@ def folder_name(typed: str) -> str:
 
 
 class RecentPanel:
-    """What to go on with: the last session and, while none is open, recordings opened before; an engine that has ended.
+    """Ways to continue: the last session and, while none is open, recent recordings; also restarts an ended engine.
 
     Args:
         kept: folder of the session files. browse: asks for a recording.
@@ -88,7 +88,7 @@ class RecentPanel:
         self._restart = add_button(
             page.gui, "Start the engine again", lambda _: page.send(Restart()), viser.Icon.REFRESH, visible=False
         )
-        self._last = page.gui.add_html("")  # it stays as long as the recording is open, so that nothing below moves
+        self._last = page.gui.add_html("")  # shown as long as the recording is open, so that nothing below moves
         self._browse = add_button(
             page.gui, "Open a recording…", browse, viser.Icon.FOLDER_OPEN, color=None, visible=False
         )
@@ -138,14 +138,14 @@ class RecentPanel:
 
 
 def session_text(saved: SavedSession) -> str:
-    """How far a session came, and what the user did in it."""
+    """How far a session got, and how many edits and notes the user made."""
     counts = {"loop edit": len(saved.state.edits), "note": len(saved.state.notes)}
     done = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
     return ", ".join([saved.opened.recording.name, f"frame {saved.frame:,}", *done])
 
 
 class FilesPanel:
-    """Buttons that open a file browser, and that save, each in the browser that asked for it.
+    """Buttons that open a file browser or save results, each in the browser where it was clicked.
 
     Args:
         results: folder below which results are saved.
@@ -214,7 +214,7 @@ class FilesPanel:
                 gui.add_button(f"Stop comparing with {recording.truth.name}", color="gray").on_click(stop)
 
     def _offer(self, client: viser.ClientHandle) -> None:
-        """Every file of the results that were saved last, each to be downloaded by a click."""
+        """List the files of the newest saved results; a click downloads one."""
         folder = last_saved(self._page.snapshot())
         if folder is None or not folder.is_dir():
             raise HemislamError(f"The folder {folder} is gone; save the results again.")
@@ -225,7 +225,7 @@ class FilesPanel:
                 add_button(client.gui, text, partial(_send_file, path), viser.Icon.DOWNLOAD)
 
     def ask_where(self, client: viser.ClientHandle, format: str = "") -> None:
-        """Ask for a folder, the files and the choice of points, and save. format: one of `FORMATS`, chosen at first."""
+        """Ask for a folder, the files and the choice of points, and save. format: one of `FORMATS`, the preset."""
         recording, clip = self._page.snapshot().recording, self._page.snapshot().clip
         if recording is None:
             return
@@ -283,11 +283,11 @@ def _send_file(path: Path, client: viser.ClientHandle) -> None:
 
 
 class FileList:
-    """Folders to go through and files to choose from, in a dialog.
+    """A file browser in a dialog: folders to open and files to choose.
 
     Args:
         suffixes: of the files that may be chosen. nothing: shown for a folder without such files.
-        choose: called with the file, and `close` after it; a HemislamError that it raises is shown instead.
+        choose: called with the file, and then `close`; if `choose` raises a HemislamError, that is shown instead.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
-"""Shapes that explain the scan: the seed wedge, the sensor's field of view, the ground plane's pose.
+"""Shapes that explain the scan: the seed wedge, the sensor's field of view, and the ground plane.
 
-All in the LiDAR frame and metres unless said otherwise; pure functions of arrays.
+Pure functions of arrays, in the LiDAR frame and metres unless stated otherwise.
 """
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from app.slam.lie import quaternion
 from app.slam.types import F32, F64, U16
 
 STILL_M: Final = 1e-3
-"""Nothing is drawn again for a move up to this: each loop moves most of the map by hundredths of a millimetre."""
+"""Moves up to this are not redrawn: each loop moves most of the map by hundredths of a millimetre."""
 _ARC_POINTS: Final = 17
 
 
 @dataclass(frozen=True, slots=True)
 class Wedge:
-    """Where seeds are looked for.
+    """The region in which the engine looks for seeds.
 
     Attributes:
         vertices: (v, 3) float32 and faces: (f, 3) uint32 of the translucent sector.
@@ -65,7 +65,7 @@ def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float) -> Wedge 
         elevations: (m,) rad, of the outermost lines. down: (3,) unit.
 
     Returns:
-        None when no line comes that near to straight down.
+        None if no scan line comes within `alpha` of `down`.
     """
     arcs = []
     for elevation in np.sort(elevations[np.isfinite(elevations)]):
@@ -92,7 +92,7 @@ def seed_wedge(elevations: F64, down: F64, alpha: float, reach: float) -> Wedge 
 
 
 def field_of_view(lowest: float, highest: float, radius: float) -> F32:
-    """(s, 2, 3) line segments of the dome between two elevations (rad): what the sensor sees."""
+    """(s, 2, 3) line segments of the sensor's field of view: a dome between two elevations (rad)."""
     azimuth = np.linspace(0.0, 2 * np.pi, 49)
     parallels = [_directions(np.full_like(azimuth, e), azimuth) for e in np.linspace(lowest, highest, 4)[:3]]
     climb = np.linspace(lowest, highest, 9)
@@ -135,5 +135,5 @@ def rotation_to(normal: F64) -> F64:
 
 
 def wxyz(rotation: F64) -> F64:
-    """(3, 3) rotation to a quaternion in the scene's order: w, x, y, z."""
+    """Convert a (3, 3) rotation to a quaternion in the scene's order: w, x, y, z."""
     return quaternion(rotation)[[3, 0, 1, 2]]

@@ -1,4 +1,4 @@
-"""Georeference the map in the page: choose fixes or control points, see residuals, accept or reject, pick points."""
+"""Georeferencing in the page: choose fixes or control points, see residuals, accept or reject them, pick points."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ _PICK: Final = "Pick it on the map"
 _POINT, _SPHERE = "a point", "a sphere's centre"
 _FIXES: Final = (".csv", ".txt", ".nmea", ".log", ".ubx")
 _MOST_BYTES: Final = 64 << 10
-"""Of a table of control points: the session file holds it."""
+"""Largest size of a table of control points, which is stored in the session file."""
 _GOOD, _BAD = (80, 220, 150), (255, 90, 90)
 _SIZE_M: Final = 0.12
 
@@ -40,7 +40,7 @@ class GeoreferencePanel:
     """Widgets in the caller's container; fixes and control points in the scene, below the map's node.
 
     Args:
-        folders: where files of fixes may be. measure: takes the clicks by which control points are picked.
+        folders: where files of fixes may be. measure: takes the clicks that pick control points.
     """
 
     def __init__(self, page: Page, folders: Folders, measure: MeasurePanel) -> None:
@@ -48,7 +48,7 @@ class GeoreferencePanel:
         self._page, self._folders, self._measure = page, folders, measure
         self._changes, self._scene_changes = Changes(), Changes()
         self._shown: Survey | None = None  # what the widgets were last set to
-        self._open: Path | None = None  # the recording for which that was
+        self._open: Path | None = None  # the recording that was open then
         self._file: Path | None = None
         self._control = ""
         self._nodes: list[Any] = []
@@ -90,7 +90,7 @@ class GeoreferencePanel:
 
     # --- what is chosen --------------------------------------------------------------------------
     def survey(self) -> Survey | None:
-        """As the widgets say. Raises HemislamError: a number is none, or a file is not chosen yet."""
+        """The survey as set in the widgets. Raises HemislamError: a number is invalid, or no file is chosen yet."""
         if self._by.value == NOTHING:
             return None
         if self._by.value == FILE and self._file is None:
@@ -130,7 +130,7 @@ class GeoreferencePanel:
         self._show_widgets()
 
     def _show(self, survey: Survey | None, otherwise: str) -> None:
-        """Set the widgets to what the session holds; otherwise: what to offer if that is nothing."""
+        """Set the widgets to the session's survey; otherwise: the choice to preselect if there is no survey."""
         self._shown = survey
         if survey is None:
             show(self._by, otherwise)
@@ -160,7 +160,7 @@ class GeoreferencePanel:
 
     # --- picking ---------------------------------------------------------------------------------
     def _picked(self, spot: Spot, current: Snapshot) -> None:
-        """A click met the map: the point itself, or the centre of the sphere there, is the chosen control point."""
+        """Assign the clicked point, or the centre of the sphere there, to the chosen control point."""
         poses, at, name = current.keyframe_poses, spot.at, self._name.value
         try:
             if self._fit.value == _SPHERE:
@@ -179,7 +179,7 @@ class GeoreferencePanel:
 
     # --- what came of it -------------------------------------------------------------------------
     def draw(self, current: Snapshot) -> None:
-        """Show what the session holds and how it lies."""
+        """Show the session's survey and its fit."""
         earth, recording = current.earth, current.recording
         opened = recording.path if recording is not None else None
         if earth.survey != self._shown or opened != self._open:
@@ -210,7 +210,7 @@ class GeoreferencePanel:
                 self._nodes.append(scene.add_label(f"{name}/{text}", text, position=place))
 
     def _act(self, word: str, _: viser.ClientHandle) -> None:
-        """What the table sends: "override fix 12", "drop P1", "undo", "redo"."""
+        """Handle what the table sends: "override fix 12", "drop P1", "undo", "redo"."""
         earth = self._page.snapshot().earth
         match word.split(" ", 1):
             case ["undo"]:
@@ -227,7 +227,7 @@ class GeoreferencePanel:
 
 
 def _result(current: Snapshot) -> str:
-    """The georeference in words and as a table; what is open, and what can be undone."""
+    """The result in words and as a table, with the problem, if any, and what can be undone."""
     earth, loops = current.earth, current.loops
     assert earth.survey is not None
     found, undo = earth.found, [describe_edit(edits[-1]) if edits else "" for edits in (loops.undo, loops.redo)]

@@ -1,4 +1,4 @@
-"""What the georeference panel shows: rows of the table, lines in the scene, and the centre of a target."""
+"""Values for the georeference panel: rows of the table, lines in the scene, and the centre of a target sphere."""
 
 from typing import Any, Final, NamedTuple
 
@@ -17,7 +17,7 @@ from app.ui.measure_maths import around
 
 MOST_ROWS: Final = 100
 _NEAR_M, _FEWEST, _WORST_M = 0.03, 12, 0.01
-"""Largest distance (m) of a point of a sphere from it; how many are needed; and their largest RMS distance (m)."""
+"""Points of a sphere: largest distance from its surface (m), how many are needed, and largest RMS distance (m)."""
 
 
 class Row(NamedTuple):
@@ -31,7 +31,7 @@ class Row(NamedTuple):
 
 
 def rows_of(found: Alignment, current: Snapshot) -> list[Row]:
-    """Those that are left out or overridden first, then by their residuals."""
+    """Rows of the table: rejected and overridden entries first, then by decreasing residual."""
     survey = current.earth.survey
     kind = POINT if survey is not None and survey.control else FIX
     edited = {edit.what for edit in current.loops.undo if isinstance(edit, Override)}
@@ -51,14 +51,14 @@ def rows_of(found: Alignment, current: Snapshot) -> list[Row]:
 
 
 def lines_of(found: Alignment) -> tuple[F32, F32]:
-    """(n, 3) where fixes or points were measured, and (n, 2, 3) lines from there to where the map has them, m."""
+    """(n, 3) m, measured positions of fixes or points, and (n, 2, 3) m, lines from these to their places in the map."""
     measured = found.reference.from_crs(found.grid)
     at = measured - found.residuals @ np.array(found.reference.rotation)
     return measured.astype(np.float32), np.stack((measured, at), axis=1).astype(np.float32)
 
 
 def names_of(text: str) -> tuple[str, ...]:
-    """Of the control points in a table, each once: the page goes blank if a dropdown offers one twice.
+    """Names of the control points in a table, each once: a dropdown with duplicates would blank the page.
 
     Raises:
         HemislamError: it has no heading, or a row is cut.
@@ -67,7 +67,7 @@ def names_of(text: str) -> tuple[str, ...]:
 
 
 def numbers_in(text: str, what: str, count: int) -> list[float]:
-    """As many numbers as there must be, or none. Raises HemislamError, naming `what`."""
+    """Exactly `count` numbers, or none. Raises HemislamError, which names `what`."""
     try:
         found = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -78,15 +78,18 @@ def numbers_in(text: str, what: str, count: int) -> list[float]:
 
 
 def centre_of_sphere(chunks: tuple[Chunk, ...], poses: F64, spot: Spot, radius: float) -> tuple[float, float, float]:
-    """Of a sphere of known radius (m), by the points around a spot on it; m, in the IMU frame of the spot's keyframe.
+    """The centre of a sphere of known radius (m), fitted to the points around a spot on it.
 
     Args:
         poses: (k, 4, 4) T_map_imu of the chunks' keyframes.
 
+    Returns:
+        m, in the IMU frame of the spot's keyframe.
+
     Raises:
-        HemislamError: what is there is no such sphere.
+        HemislamError: the points there do not form such a sphere.
     """
-    from scipy import optimize  # the page imports this module, and few look for spheres
+    from scipy import optimize  # imported here: the page loads this module, but few users need spheres
 
     least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
     T = poses[spot.keyframe]
