@@ -1,4 +1,4 @@
-"""How a live source is doing: rates, ages, losses, clocks. Hidden while a recording is open."""
+"""The state of a live source: rates, ages, losses, clocks. Hidden while a recording is open."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -13,9 +13,9 @@ from app.ui.widgets import Page, add_button
 
 OLD_S: Final = 0.5
 SILENT_S: Final = 2.0
-"""Time since the last arrival after which a sensor is late, or silent. The slowest one sends five times a second."""
+"""Time since the last arrival after which a sensor is called late or silent. The slowest sends five times a second."""
 BUSY_BACKLOG: Final = 5
-"""Scans waiting: half a second at 10 Hz. At 100 the oldest are dropped."""
+"""Most waiting scans without a warning: half a second at 10 Hz. At 100 waiting scans, the oldest are dropped."""
 OFFSET_S: Final = 0.05
 """Largest harmless offset between the sensors' clocks; more is visible in the map when the device turns."""
 LOST_SHARE: Final = 0.001
@@ -33,13 +33,13 @@ _TROUBLES: Final = {
     "reconnects": "reconnections",
     "restarts": "restarts of the receiver",
 }
-"""Counted, and shown once they are not zero."""
+"""Counts that are shown only if they are not zero."""
 
 
 def live_html(state: LiveState, *, ended: bool = False, paused: bool = False) -> str:
-    """The panel: one tile a reading, coloured by how good it is; then the rarer counts.
+    """The panel: one tile per reading, coloured by its quality; then the rarer counts.
 
-    ended: nothing more will come; these are the last readings. paused: by the user, so that scans wait.
+    ended: the source has ended, and these are the last readings. paused: the user has paused, so that scans wait.
     """
     judged = ("ended", BAD) if ended else verdict(state, paused=paused)
     rare = [f"{count:,} {text}" for name, text in _TROUBLES.items() if (count := getattr(state.counters, name))]
@@ -98,7 +98,7 @@ def _age(age_s: float) -> str:
 
 
 class LivePanel:
-    """The panel in the caller's container; while a recording is open, the way back to the source, if there is one."""
+    """The panel in the caller's container; while a recording is open, a button that returns to the live source."""
 
     def __init__(self, page: Page) -> None:
         self._page = page

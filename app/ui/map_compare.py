@@ -1,4 +1,4 @@
-"""Distance of the map to another one: chosen from the disk or made by the truth, in colours and as a histogram."""
+"""Distance of the map to another map, in colours and as a histogram. The other map is a file or made by the truth."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +28,7 @@ _OLD: Final = "The map has changed since; points without a distance are grey. Co
 
 
 class MapComparePanel:
-    """Widgets in the caller's container; what they find colours the map.
+    """Widgets in the caller's container; the distances colour the map.
 
     Args:
         results: folder below which results are saved. colour_by: chooses a colour mode.
@@ -38,7 +38,7 @@ class MapComparePanel:
         gui = page.gui
         self._page, self._folders, self._results, self._colour_by = page, folders, results, colour_by
         self._session, self._before = -1, LOOK  # the colour mode that distances replaced
-        self._chunks: tuple[Chunk, ...] = ()  # that were compared last
+        self._chunks: tuple[Chunk, ...] = ()  # chunks that were compared last
         self._name = ""
         self._comparison: Comparison | None = None
         self._distance: MapNumbers | None = None
@@ -93,7 +93,7 @@ class MapComparePanel:
         self._work.stop()
 
     def _clear(self) -> None:
-        """What was compared belongs to the session before."""
+        """Discard the comparison of the previous session."""
         self.close()
         if self._comparison is not None:
             self._comparison = self._distance = None

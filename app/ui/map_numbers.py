@@ -1,4 +1,4 @@
-"""Numbers of the map's points that depend on the whole map: how dense it is, how far it lies from another one."""
+"""Numbers of the map's points that depend on the whole map: its density, and its distance from another map."""
 
 import threading
 from collections.abc import Callable, Mapping
@@ -14,9 +14,9 @@ from app.slam.types import F32, F64
 from app.ui.colours import Limits
 
 _WAITS: Final = 3.0
-"""Between two counts, this many times as long as the last one took passes."""
+"""The pause between two counts is this many times the duration of the last count."""
 _SHARE: Final = 98.0
-"""Percent of the counts that the colours spread over."""
+"""Percent of the counts that the colours span."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +24,7 @@ class MapNumbers:
     """A number for each point of the map.
 
     Attributes:
-        by_keyframe: chunks as they were, with (n,) numbers of their points, by index. limits: ends of the colour map.
+        by_keyframe: by index, the chunk at that time and (n,) numbers of its points. limits: ends of the colour map.
     """
 
     by_keyframe: Mapping[int, tuple[Chunk, F32]]
@@ -32,12 +32,12 @@ class MapNumbers:
 
     @classmethod
     def split(cls, chunks: tuple[Chunk, ...], numbers: F32, limits: Limits) -> "MapNumbers":
-        """numbers: (n,) of the points of all chunks, in their order."""
+        """Split `numbers`, (n,) of the points of all chunks in order, by chunk."""
         parts = np.split(numbers, np.cumsum([len(chunk.points) for chunk in chunks])[:-1])
         return cls({chunk.index: (chunk, part) for chunk, part in zip(chunks, parts, strict=True)}, limits)
 
     def of(self, chunk: Chunk) -> F32:
-        """(n,) numbers of a chunk's points; nan if it has changed, or was not there."""
+        """(n,) numbers of a chunk's points; NaN if the chunk is new or has changed since."""
         known, numbers = self.by_keyframe.get(chunk.index, (None, None))
         return numbers if known is chunk and numbers is not None else np.full(len(chunk.points), np.nan, np.float32)
 
@@ -53,7 +53,7 @@ class Density:
         self._found: MapNumbers | None = None
 
     def of(self, chunks: tuple[Chunk, ...], poses: F64) -> MapNumbers | None:
-        """What was counted last; None before that. poses: (k, 4, 4) T_map_imu of at least these keyframes."""
+        """The last counts; None before the first. poses: (k, 4, 4) T_map_imu of at least these keyframes."""
         same = chunks is self._counted[0] and poses is self._counted[1]
         counting = self._thread is not None and self._thread.is_alive()
         if not (same or counting or not chunks or self._now() < self._due):

@@ -27,7 +27,7 @@ _WIDTH: Final = 0.01
 _COLOURS: Final = {False: (255, 205, 80), True: (150, 90, 0)}
 """On a dark and on a light background."""
 _CHOSEN: Final = "● "
-"""Before the tool that clicks are for."""
+"""Marks the tool that takes clicks."""
 _SIZE_M: Final = 0.08
 
 
@@ -39,14 +39,14 @@ class MeasurePanel:
         self._page = page
         self._changes = Changes()
         self._kind = STOP
-        self.taker: Callable[[Spot, Snapshot], None] | None = None  # of a spot that is being picked, not measured
+        self.taker: Callable[[Spot, Snapshot], None] | None = None  # takes the next spot instead of a measure
         self._where: GeoReference | None = None
-        self._click: tuple[F64, F64, float] | None = None  # of the newest click: its ray in the map, and its width
-        self._spots: tuple[Spot, ...] = ()  # of the measure that is begun
-        self._session = -1  # that they are of
+        self._click: tuple[F64, F64, float] | None = None  # newest click: its ray in the map, and its angular radius
+        self._spots: tuple[Spot, ...] = ()  # of the unfinished measure
+        self._session = -1  # session of these spots
         self._nodes: list[Any] = []
         self._measured: list[tuple[Measure, F64, Numbers]] = []
-        self._map: tuple[object, object] = None, None  # chunks and poses that they are of
+        self._map: tuple[object, object] = None, None  # chunks and poses of the drawn measures
         self._light = False
         self._kinds = gui.add_button_group("measure", tuple(_SPOTS), hint="Then click points of the map.")
         self._kinds.on_click(by_user(lambda kind, _: self.begin(kind.removeprefix(_CHOSEN))))
@@ -63,7 +63,7 @@ class MeasurePanel:
 
     @property
     def picking(self) -> bool:
-        """Whether clicks in the scene are for a measure."""
+        """Whether this panel takes clicks in the scene."""
         return self._kind != STOP
 
     def begin(self, kind: str, taker: Callable[[Spot, Snapshot], None] | None = None) -> None:
@@ -72,12 +72,12 @@ class MeasurePanel:
         self._kind, self._spots = kind, ()
 
     def pick(self, taker: Callable[[Spot, Snapshot], None]) -> None:
-        """Give `taker` the spot that the next click meets, instead of measuring it."""
+        """Give `taker` the spot of the next click, instead of measuring it."""
         self.begin(PICK, taker)
 
     def draw(self, current: Snapshot, view: View) -> None:
-        """Take the newest click, and show what the session keeps."""
-        if current.session != self._session:  # the spots are on another walk
+        """Handle the newest click, and show the session's measures."""
+        if current.session != self._session:  # the spots belong to another session
             self._session, self._spots = current.session, ()
         click, self._click = self._click, None
         poses = current.keyframe_poses
@@ -137,11 +137,11 @@ class MeasurePanel:
                 self._nodes.append(add_lines(scene, f"{name}/lines", segments(exact), colour, 2.5))
             if text:
                 self._nodes.append(scene.add_label(f"{name}/label", text, position=at.mean(axis=0)))
-        for number, place in enumerate(begun if begun is not None else ()):  # a label is seen whatever is before it
+        for number, place in enumerate(begun if begun is not None else ()):  # a label is visible through other objects
             self._nodes.append(scene.add_label(f"{ROOT}/measures/begun/{number}", f"{number + 1}", position=place))
 
     def _draw_list(self, later: int, map_shown: bool) -> None:
-        """later: how many measures are on keyframes that are not here, as after going back or with other settings."""
+        """later: number of measures on keyframes that do not exist now, for example after going back."""
         left = _SPOTS.get(self._kind, 0) - len(self._spots)
         self._kinds.options = (
             *(_CHOSEN + kind if kind == self._kind else kind for kind in _SPOTS),
@@ -158,14 +158,14 @@ class MeasurePanel:
         self._list.visible, self._save.visible = bool(rows or later), bool(rows)
 
     def clicked(self, event: viser.SceneClickEvent) -> bool:
-        """Take a click in the scene, while one is measured; whether it was taken. `draw` uses it."""
+        """Take a click in the scene while measuring; `draw` uses it. Returns whether it was taken."""
         if not self.picking:
             return False
         self._click = (*self._page.in_map(event), _WIDTH * event.client.camera.fov)
         return True
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
-        """What the list sends: "delete 3 door", the place and the name in the list as that browser shows it."""
+        """Handle what the list sends: "delete 3 door", with index and name as that browser shows them."""
         for place, (measure, *_) in enumerate(self._measured):
             if word == f"delete {place} {measure.name}":
                 self._page.send(EditMeasure(measure, ""))
@@ -187,6 +187,6 @@ class MeasurePanel:
 
 
 def _label(name: str, at: F64, found: Numbers) -> str:
-    """In the scene: a distance or angle with its number. The coordinates of a point would cover the map around it."""
+    """Text of a label in the scene. A distance or angle has its number; a point's coordinates would cover the map."""
     short = label_text(name)
     return short if len(at) == 1 else f"{short}: {words(at, found).split(': ')[0]}"

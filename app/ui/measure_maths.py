@@ -1,4 +1,4 @@
-"""Measures in the map: the point that a click meets, coordinates, distances, heights, angles; as words and as CSV."""
+"""Measures in the map: the point under a click, coordinates, distances, heights, angles; as words and as CSV."""
 
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
@@ -19,23 +19,23 @@ from app.slam.types import F32, F64, is_ground
 from app.ui.chunks import shown_points
 
 _GAP_M: Final = 0.2
-"""Points that a click meets are of one surface as long as each lies no farther behind the one before it."""
+"""Points under a click belong to one surface as long as each is at most this far behind the one before."""
 _AROUND_M: Final = (0.3, 1.0)
-"""Ground below a point is looked for within the first of these distances beside it, or else within the second."""
+"""Ground below a point is searched within the first of these horizontal distances, then within the second."""
 _FLOOR_M: Final = 0.3
-"""Ground points at most this far below the highest belong to the same floor."""
+"""Ground points at most this far below the highest one belong to the same floor."""
 _KEYFRAMES: Final = 20
-"""Nearest ones, among whose points the ground is looked for."""
+"""Ground is searched in the points of this many nearest keyframes."""
 COLUMNS: Final = (
     "name", "x_m", "y_m", "z_m", "height_m", "distance_m", "horizontal_m", "vertical_m", "angle_deg",
 )  # fmt: skip
 ON_EARTH: Final = ("east_m", "north_m", "grid_height_m")
-"""Beside them where the map has coordinates of others."""
+"""Further columns if the map is georeferenced."""
 
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """What a measure comes to; nan where it has no such number. height: over the ground below, m. angle: degrees."""
+    """The results of a measure; NaN if they do not apply. height: above the ground below, m. angle: degrees."""
 
     height: float = np.nan
     distance: float = np.nan
@@ -45,7 +45,7 @@ class Numbers:
 
 
 def load() -> None:
-    """Load the kernel of `meet` before the first click, which it would delay."""
+    """Load the kernel of `meet` in advance, so that it does not delay the first click."""
     points, nothing = np.empty((0, 3), np.float32), np.empty(0, np.float32)
     points.setflags(write=False)  # as those of chunks are
     in_cone(points, np.zeros(3), np.zeros(3), 0.0, np.empty(0, np.int32), nothing, nothing)
@@ -62,12 +62,12 @@ def meet(
     moving: bool = True,
     clip: Box | None = None,
 ) -> Spot | None:
-    """The visible point that a click means: of those at the front, the one nearest to its ray; None if it meets none.
+    """The visible point under a click: of the points on the front surface, the nearest to the ray; None if none.
 
     Args:
         poses: (k, 4, 4) T_map_imu of the chunks' keyframes. origin, direction: (3,) of the ray, in the map.
-        width: rad, how far beside the ray a point may be seen. ceilings, moving: whether they are shown.
-        clip: outside which points are hidden.
+        width: rad, largest angle between a point and the ray. ceilings, moving: whether such points are shown.
+        clip: points outside this box are hidden.
     """
     most = max((len(chunk.points) for chunk in chunks), default=0)
     hits, along, off = np.empty(most, np.int32), np.empty(most, np.float32), np.empty(most, np.float32)
@@ -82,7 +82,7 @@ def meet(
     every = np.sort(np.concatenate([np.empty(0), *(along for along, *_ in found)]))
     if not len(every):
         return None
-    front = every[np.argmax(np.append(np.diff(every), np.inf) > _GAP_M)]  # of a wall along the ray, to its far end
+    front = every[np.argmax(np.append(np.diff(every), np.inf) > _GAP_M)]  # includes all of a wall along the ray
     best = [np.where(along <= front, off, np.inf) for along, off, *_ in found]
     which = int(np.argmin([one.min(initial=np.inf) for one in best]))
     chunk, points = found[which][2:]
@@ -91,10 +91,11 @@ def meet(
 
 
 def places(measure: Measure, poses: F64, frames: Mapping[int, int] = MappingProxyType({})) -> F64 | None:
-    """(1 to 3, 3) m, its spots in the map. None: after going back or with other settings, one's keyframe is not there.
+    """(1 to 3, 3) m, the spots in the map. None: a spot's keyframe does not exist, after going back or with other
+    settings.
 
     Args:
-        poses: (k, 4, 4) T_map_imu of the keyframes. frames: of keyframes, by their index, as far as they are known.
+        poses: (k, 4, 4) T_map_imu of the keyframes. frames: the frame of each known keyframe, by its index.
     """
     for spot in measure.spots:
         other = spot.frame not in (-1, frames.get(spot.keyframe, spot.frame))
@@ -104,7 +105,7 @@ def places(measure: Measure, poses: F64, frames: Mapping[int, int] = MappingProx
 
 
 def numbers(at: F64, chunks: tuple[Chunk, ...], poses: F64) -> Numbers:
-    """Of one to three (n, 3) places in the map."""
+    """The results for one to three (n, 3) places in the map."""
     if len(at) == 1:
         return Numbers(height=height(at[0], chunks, poses))
     a, b = at[0] - at[1], at[-1] - at[1]
@@ -116,11 +117,11 @@ def numbers(at: F64, chunks: tuple[Chunk, ...], poses: F64) -> Numbers:
 
 
 def height(place: F64, chunks: tuple[Chunk, ...], poses: F64) -> float:
-    """m over the highest floor that is labelled ground below a (3,) place in the map; nan if there is none."""
+    """Height (m) of a (3,) place above the highest floor labelled ground below it; NaN if there is none."""
     near = poses[[chunk.index for chunk in chunks], :2, 3] - place[:2]
     ground = [_ground(chunks[k], poses[chunks[k].index]) for k in np.argsort(np.linalg.norm(near, axis=1))[:_KEYFRAMES]]
     points = np.concatenate([np.empty((0, 3)), *ground]) - place
-    points = points[points[:, 2] <= _FLOOR_M / 6]  # the place may be on the ground itself, which is rough
+    points = points[points[:, 2] <= _FLOOR_M / 6]  # the place may lie on the ground itself, which is rough
     for around in _AROUND_M:
         z = points[np.hypot(points[:, 0], points[:, 1]) < around, 2]
         if len(z):
@@ -145,7 +146,7 @@ def around(chunks: tuple[Chunk, ...], poses: F64, place: F64, radius: float) -> 
 
 
 def words(at: F64, found: Numbers, where: GeoReference | None = None) -> str:
-    """What a measure says, in metres and degrees. where: on Earth the map is, if that is known."""
+    """A measure in words, in metres and degrees. where: the map's georeference, if known."""
     if len(at) == 1:
         above = f", {round(found.height, 2) + 0.0:.2f} m above the ground" if np.isfinite(found.height) else ""
         own = f"x {at[0, 0]:.3f}, y {at[0, 1]:.3f}, z {at[0, 2]:.3f} m{above}"
@@ -159,7 +160,7 @@ def words(at: F64, found: Numbers, where: GeoReference | None = None) -> str:
 
 
 def as_csv(measured: list[tuple[Measure, F64, Numbers]], where: GeoReference | None = None) -> str:
-    """A row for each spot, in the map's axes and where it is on Earth; the first of a measure has its numbers too."""
+    """A row per spot, in the map and, if georeferenced, on Earth; the first row of a measure also has its results."""
     rows: list[tuple[object, ...]] = [(*COLUMNS, *(ON_EARTH if where is not None else ()))]
     for measure, at, found in measured:
         cells = [f"{value:.4f}" if np.isfinite(value) else "" for value in astuple(found)]

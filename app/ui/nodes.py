@@ -1,4 +1,4 @@
-"""Scene nodes as this page draws them: points, lines and translucent surfaces placed by a pose, and long paths."""
+"""Scene nodes of the page: points, lines and translucent surfaces placed by a pose, and long paths."""
 
 from typing import Any, Final
 
@@ -13,15 +13,15 @@ from app.ui.geometry import STILL_M, wxyz
 PATH_COLOUR: Final = (255, 92, 141)
 TRUTH_COLOUR: Final = (120, 150, 255)
 BLOCK: Final = 256
-"""Segments per node: a new frame sends only the newest node again, not an hour's path."""
+"""Segments per node, so that a new frame resends only the newest node, not the path of an hour."""
 _MOST_TRUTH_POINTS: Final = 4000
 _LABEL_TEXT: Final = 32
-"""Letters of what a user wrote that a label in the scene shows."""
+"""Most letters of a user's text in a label in the scene."""
 
 NO_POINTS: Final = np.zeros((1, 3), np.float32)
 NO_COLOURS: Final = np.zeros((1, 3), np.uint8)
 NO_LINES: Final = np.zeros((1, 2, 3), np.float32)
-"""What a node is made with before there is anything to draw: the page cannot draw a node without points."""
+"""Contents of a node before there is anything to draw: the page cannot draw a node without points."""
 
 
 def _posed(T: F64 | None) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def place(node: viser.SceneNodeHandle, T: F64) -> None:
 
 
 def label_text(text: str) -> str:
-    """What a label in the scene shows of a text, which may be long: all of it would cover the map."""
+    """A text shortened for a label in the scene, since a long one would cover the map."""
     return text if len(text) <= _LABEL_TEXT else text[: _LABEL_TEXT - 1].rstrip() + "…"
 
 
@@ -97,7 +97,7 @@ class TrajectoryNode:
         self._blocks: list[viser.LineSegmentsHandle] = []
 
     def draw(self, positions: F64, visible: bool) -> None:
-        """Draw (n, 3) positions, sending the blocks that differ from what is drawn."""
+        """Draw (n, 3) positions, sending only the blocks that changed."""
         while len(self._blocks) > -(-max(len(positions) - 1, 0) // BLOCK):
             self._blocks.pop().remove()
         for index, first in enumerate(range(0, len(positions) - 1, BLOCK)):
@@ -110,16 +110,16 @@ class TrajectoryNode:
 
 
 class Truth:
-    """The true path: sent once in the truth's own frame; the node's pose puts it on the map."""
+    """The true path, sent once in the truth's own frame; the pose of its node places it in the map."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene = scene
         self._root = root
-        self._lines: list[viser.LineSegmentsHandle] = []  # one, or none
+        self._lines: list[viser.LineSegmentsHandle] = []  # one or none
         self._loaded: F64 | None = None
 
     def draw(self, positions: F64 | None, T_map_truth: F64 | None, visible: bool) -> None:
-        """Show (m, 3) positions where `T_map_truth` (4, 4) puts them; hidden while that is unknown."""
+        """Show (m, 3) positions transformed by `T_map_truth` (4, 4); hidden while that is unknown."""
         if positions is not self._loaded:
             self._loaded = positions
             clear(self._lines)

@@ -1,4 +1,4 @@
-"""Notes: a field for a new one, their list, and pins in the scene where the sensor was when they were taken."""
+"""Notes: a field for a new note, the list of notes, and pins in the scene at the sensor's positions."""
 
 from typing import Final
 
@@ -21,7 +21,7 @@ _PIN_COLOUR: Final = (255, 190, 60)
 _PIN_M: Final = 0.16
 _REACH_PX: Final = 14.0
 _LETTER_PX: Final = 6.0
-"""A click within this distance of a pin, or on its text to the right of it, is meant for it."""
+"""A click within this distance of a pin, or on the text to its right, selects the pin."""
 
 
 class NotesPanel:
@@ -52,7 +52,7 @@ class NotesPanel:
             show(self._text, "")
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
-        """What the list sends: "go 812", "edit 3 91c5", "delete 3 91c5": the note as that browser shows it."""
+        """Handle what the list sends: "go 812", "edit 3 91c5", "delete 3 91c5"; see `_word`."""
         verb, _, what = word.partition(" ")
         if verb == "go" and what.isdecimal():
             self._page.send(Seek(int(what)))
@@ -72,7 +72,7 @@ class NotesPanel:
 
     # --- pins ------------------------------------------------------------------------------------
     def _draw_pins(self, snapshot: Snapshot, view: View) -> None:
-        """Pin the newest notes of frames that the trajectory reaches."""
+        """Draw pins for the newest notes whose frames are in the trajectory."""
         pinned = pins(snapshot.notes, len(snapshot.trajectory)) if view.notes else []
         where = snapshot.trajectory[[frame for frame, _ in pinned]].reshape(-1, 3)
         if not self._changes(str(pinned), str(where.round(2).tolist())):
@@ -86,7 +86,7 @@ class NotesPanel:
             self._nodes.append(scene.add_label(f"{root}/{frame}", text, position=position, anchor="center-left"))
 
     def _pin_at(self, event: viser.SceneClickEvent) -> int | None:
-        """The frame of the pin that was clicked."""
+        """The frame of the clicked pin."""
         if not self._pinned:
             return None
         camera = event.client.camera
@@ -97,19 +97,19 @@ class NotesPanel:
         return self._pinned[int(hit[np.hypot(x, y)[hit].argmin()])][0] if len(hit) else None
 
     def clicked(self, event: viser.SceneClickEvent) -> bool:
-        """Go to the frame of the pin that was clicked in the scene; whether one was."""
+        """Go to the frame of the pin clicked in the scene. Returns whether a pin was clicked."""
         if (frame := self._pin_at(event)) is not None:
             self._page.send(Seek(frame))
         return frame is not None
 
 
 def _word(place: int, note: Note) -> str:
-    """Which note a click is for: a list that is not up to date has another one at this place."""
+    """Index and hash of a note: in an outdated list, another note may have this index."""
     return f"{place} {hash(note):x}"
 
 
 def pins(notes: tuple[Note, ...], frames: int) -> list[tuple[int, str]]:
-    """Frame and text of each pin: notes of one frame share it. frames: that the trajectory has."""
+    """Frame and text of each pin; notes on the same frame share a pin. frames: number in the trajectory."""
     texts: dict[int, str] = {}
     for note in notes[-_PINNED:]:
         if 0 <= note.frame < frames:

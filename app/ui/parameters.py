@@ -1,11 +1,11 @@
-"""The parameter panel, generated from the one declaration (`app.slam.params.leaves`).
+"""The parameter panel, generated from the declaration of the parameters (`app.slam.params.leaves`).
 
-A number has a slider over its range, and a vector one for each component. Where a range spans decades, the slider
-offers round values, and a box above it takes any other. M, α, σ and the voxel size come first, the others in a folder
-per section.
+A number has a slider over its range; a vector has one for each component. If a range spans decades, the slider offers
+round values, and a box above it takes any other value. M, α, σ and the voxel size come first; the others are in one
+folder per section.
 
-Browsers and the engine may both change a value. What a user set is sent as a command; the snapshot's value flows back,
-except into a control that was touched a moment ago: an older snapshot must not move the slider under the hand.
+Browsers and the engine may both change a value. A value set by a user is sent as a command. Controls then follow the
+snapshots, except those touched a moment ago: an older snapshot must not move a slider while the user drags it.
 """
 
 from collections.abc import Callable
@@ -33,25 +33,25 @@ PRIMARY: Final = {
     "ground.sigma": "σ thickness",
     "ground.voxel_size": "voxel",
 }
-"""The paper's parameters, above all others, and their names here."""
+"""The paper's parameters, shown above all others, and their names on the page."""
 
 MARK: Final[dict[Effect, str]] = {"now": "", "frame": " ▸", "restart": " ↻"}
 _MOST_STEPS: Final = 8000
-"""Of a slider with even steps. The IMU's noise spans decades: its usual values would share the first few pixels."""
+"""Most steps of a linear slider. The IMU's noise spans decades: its usual values would share the first few pixels."""
 _DIGITS: Final = 9
-"""Most digits after the point that a box shows and takes."""
+"""Most decimal places that a box shows and accepts."""
 _COMPONENTS: Final = {
     "sensor.translation": ("translation x", "translation y", "translation z"),
     "sensor.rotation": ("roll", "pitch", "yaw"),
 }
 _COLOURS: Final = LABEL_COLOURS[GROUND], LABEL_COLOURS[SEED]
 _TYPING_S: Final = 0.5
-"""A text is sent after this long without a change, and a slider that does not act at once after this long at rest."""
+"""A text, or the value of a slider that does not act at once, is sent after this long without a change."""
 _MOST_UNDONE: Final = 50
 _DRAG_S: Final = 8.0
-"""Changes of the same parameters that follow each other faster are one, unless a slider was let go between them."""
+"""Changes of the same parameters within this time count as one, unless a slider was released between them."""
 _NOTHING: Final = ("nothing changed",)
-"""What `reset` offers then: it stays, so that nothing below it moves."""
+"""The only option of `reset` if nothing changed; `reset` stays visible, so that nothing below it moves."""
 _HOLD_S: Final = 1.0
 """A control shows what the user set for this long, whatever older snapshots say."""
 
@@ -65,7 +65,7 @@ TITLES: Final = {
     "moving": "Moving points",
     "loops": "Loop search",
 }
-"""Of sections whose own names do not do."""
+"""Titles of sections whose own names are not suitable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +73,8 @@ class Widget:
     """A widget of a parameter.
 
     Attributes:
-        handle: viser's. shown: what it shows of a parameter's value. meant: the parameter's new value, from what the
-            widget shows and the present value.
+        handle: viser's. shown: converts the parameter's value to the widget's value. meant: computes the parameter's
+            new value from the widget's value and the present value.
     """
 
     handle: Any
@@ -91,14 +91,14 @@ def spoken(leaf: Leaf) -> str:
 
 
 def label(leaf: Leaf, name: str = "") -> str:
-    """Name, unit, and when a change takes effect. name: in place of the parameter's own."""
+    """Name, unit, and a mark that says when a change takes effect. name: replaces the parameter's own name."""
     name = name or spoken(leaf)
     unit = {"deg": "°"}.get(leaf.unit, leaf.unit)
     return f"{name} ({unit}){MARK[leaf.effect]}" if unit else f"{name}{MARK[leaf.effect]}"
 
 
 def add_widgets(gui: viser.GuiApi, leaf: Leaf, value: Any) -> list[Widget]:
-    """The widgets of a parameter; the first takes any value of it, or of a component."""
+    """The widgets of a parameter; the first one accepts any value of it, or of a component."""
     text, hint = label(leaf), leaf.help
     if leaf.choices:
         return [Widget(gui.add_dropdown(text, leaf.choices, initial_value=value, hint=hint))]
@@ -113,20 +113,20 @@ def add_widgets(gui: viser.GuiApi, leaf: Leaf, value: Any) -> list[Widget]:
 
 
 def _number(gui: viser.GuiApi, leaf: Leaf, value: float, text: str) -> list[Widget]:
-    """A slider over the range, or a box and below it a slider over round values."""
+    """A slider over the range, or a box with a slider over round values below it."""
     assert leaf.minimum is not None and leaf.maximum is not None and leaf.step is not None
     kind: Any = int if isinstance(leaf.default, int) else float
     handle: Any
     if leaf.maximum - leaf.minimum <= _MOST_STEPS * leaf.step:
         handle = gui.add_slider(text, kind(leaf.minimum), kind(leaf.maximum), kind(leaf.step), value, hint=leaf.help)
     else:
-        handle = gui.add_number(text, value, step=leaf.step, hint=leaf.help)  # the engine says what is out of range
+        handle = gui.add_number(text, value, step=leaf.step, hint=leaf.help)  # the engine reports values out of range
     if kind is float:
         handle.precision = _DIGITS
     widgets = [Widget(handle)]
     if isinstance(handle, viser.GuiNumberHandle):
         stops = round_values(leaf)
-        # Without a label, so that `viser_adapter.css` hides the slider's own box, which would show a place among stops.
+        # Without a label, so that `viser_adapter.css` hides the slider's own box, which would show an index of `stops`.
         slider = gui.add_slider("", 0, len(stops) - 1, 1, _nearest(stops, value), hint=leaf.help)
         widgets.append(Widget(slider, lambda value: _nearest(stops, value), lambda place, _: stops[place]))
     return widgets
@@ -145,7 +145,7 @@ def _component(gui: viser.GuiApi, leaf: Leaf, vector: tuple[float, ...], index: 
 
 
 def round_values(leaf: Leaf) -> tuple[float, ...]:
-    """1, 2 and 5 times the powers of ten within the range, on either side of zero, ascending."""
+    """1, 2 and 5 times the powers of ten within the range, positive and negative, ascending, with zero."""
     assert leaf.minimum is not None and leaf.maximum is not None and leaf.step is not None
     kind = int if isinstance(leaf.default, int) else float
     least = leaf.minimum if leaf.minimum > 0 else leaf.step
@@ -155,22 +155,22 @@ def round_values(leaf: Leaf) -> tuple[float, ...]:
 
 
 def _nearest(ascending: tuple[float, ...], value: float) -> int:
-    """The place of the value that is nearest, or of the smaller of the two around it."""
+    """Index of the nearest value; halfway between two values, of the smaller one."""
     return int(np.argmin(np.abs(np.subtract(ascending, value))))
 
 
 class ParameterHistory:
-    """The parameters as they were after each change; a drag is one change, however slow the page draws it."""
+    """The parameters after each change. Dragging a slider is one change, however slowly the page draws it."""
 
     def __init__(self) -> None:
         self._states: list[Params] = []
         self._at = -1
-        self._left: list[Params] = []  # by undo and redo, of which the engine may not have heard yet
-        self._changed: set[str] = set()  # paths, last
+        self._left: list[Params] = []  # states left by undo and redo that the engine may not know yet
+        self._changed: set[str] = set()  # paths, by the last change
         self._changed_at = -_DRAG_S
 
     def see(self, params: Params, now: float) -> None:
-        """Take in the present parameters, wherever a change came from."""
+        """Record the present parameters, whatever changed them."""
         if self._at >= 0 and params == self._states[self._at]:
             self._left.clear()
             return
@@ -181,14 +181,14 @@ class ParameterHistory:
         merged = self._at > 0 and changed == self._changed and now - self._changed_at < _DRAG_S
         del self._states[self._at + (0 if merged else 1) :]
         self._changed, self._changed_at = changed, now
-        if self._states and self._states[-1] == params:  # dragged back to where it was
+        if self._states and self._states[-1] == params:  # dragged back to the old value
             self._changed_at = -_DRAG_S
         else:
             self._states = [*self._states, params][-_MOST_UNDONE:]
         self._at = len(self._states) - 1
 
     def change(self, by: int) -> dict[str, Any]:
-        """What leads to the state before (-1) or after (1): values by dotted name; empty if there is none."""
+        """Values by dotted name that lead to the previous (-1) or next (1) state; empty if there is none."""
         if not 0 <= self._at + by < len(self._states):
             return {}
         return self._states[self._at].changed(self._states[self._at + by])
@@ -199,12 +199,12 @@ class ParameterHistory:
         self.settle()
 
     def settle(self) -> None:
-        """The next change is one of its own."""
+        """Do not merge the next change with the last one."""
         self._changed_at = -_DRAG_S
 
 
 class ParameterPanel:
-    """A control for every parameter; `draw` sends what was typed and shows what the snapshot says."""
+    """A control for every parameter; `draw` sends typed values and shows the snapshot's values."""
 
     def __init__(self, page: Page, params: Params) -> None:
         gui = self._gui = page.gui
@@ -221,7 +221,7 @@ class ParameterPanel:
             self._sections.setdefault(group, {})[leaf.name] = leaf
         self._names = {leaf.path: spoken(leaf) for leaf in leaves()}
         self._history = ParameterHistory()
-        self._released = False  # whether a slider was let go, and its last value may be on its way
+        self._released = False  # whether a slider was released whose last value may still be on its way
         self._bridge = Bridge(gui, "sliders", lambda *_: setattr(self, "_released", True))
         gui.add_html(self._bridge.live(panel("released")))
         self._opened = params
@@ -249,14 +249,14 @@ class ParameterPanel:
         gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
 
     def follow(self, a: Snapshot) -> None:
-        """Take in what A has open: `reset` leads back to the values it had then, in a fork as well."""
+        """Note the values with which A's recording was opened; `reset` restores them, also in a fork."""
         if (recording := a.recording.path.resolve() if a.recording else None) != self._recording:
             self._recording, self._opened = recording, a.params
 
     def draw(self, snapshot: Snapshot, tuning: bool = False) -> None:
-        """Bring the controls up to a snapshot. tuning: whether its scan shows what the ground sliders do."""
+        """Update the controls from a snapshot. tuning: whether the user is moving ground sliders."""
         now = self._now()
-        if engine_number(snapshot) != self._engine:  # what was set was meant for the other engine
+        if engine_number(snapshot) != self._engine:  # these edits were for the other engine
             self._engine = engine_number(snapshot)
             self._edits.clear()
         for path, edit in list(self._edits.items()):
@@ -304,7 +304,7 @@ class ParameterPanel:
             self._send(SetParams(values))
 
     def fit_lines(self, lines: int) -> None:
-        """End the slider of M at the number of scan lines that the open recording has."""
+        """Limit the slider of M to the number of scan lines of the open recording."""
         slider = self._widgets["ground.scan_lines"][0].handle
         if lines >= slider.value:
             slider.max = lines
@@ -312,7 +312,7 @@ class ParameterPanel:
     def _add(self, leaf: Leaf) -> None:
         path = leaf.path
         self._widgets[path] = widgets = add_widgets(self._gui, leaf, self._params.value(path))
-        # The four primary sliders answer while they are dragged. The other sliders have boxes to type into as well.
+        # The four primary sliders act while they are dragged. The other sliders also have boxes to type into.
         at_once = path in PRIMARY or isinstance(widgets[0].handle, viser.GuiCheckboxHandle | viser.GuiDropdownHandle)
 
         def set_by(widget: Widget) -> Callable[[Any, viser.ClientHandle], None]:
@@ -332,7 +332,7 @@ class ParameterPanel:
             widget.handle.on_update(as_set(set_by(widget)))
 
     def _add_reset(self, group: str) -> None:
-        """A button for each parameter of the group that was changed since the recording was opened, and one for all."""
+        """A button for each parameter of the group changed since the recording was opened, and one for all of them."""
         buttons = self._gui.add_button_group(
             "reset", _NOTHING, hint="Restore the value from when the recording was opened."
         )

@@ -1,4 +1,4 @@
-"""Pictures to keep: a legend and a scale drawn onto what the browser has rendered, and the stations of a flight."""
+"""Saved pictures: a legend and a scale drawn onto the browser's rendering, and the camera stations of a flight."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -16,16 +16,16 @@ from app.ui.scale import bar, length_text
 
 BACKGROUND: Final = {False: (20, 20, 20), True: (255, 255, 255)}
 _INK: Final = {False: (236, 240, 244), True: (24, 32, 42)}
-"""On a dark and on a light background."""
+"""Colours on a dark and on a light background."""
 _SMOOTH_M: Final = 1.5
 _STEP_M: Final = 0.1
 _AHEAD_M: Final = 4.0
-"""Where a flight looks: this far ahead along the path."""
+"""The camera of a flight looks this far ahead along the path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Station:
-    """Of a camera: position (3,), orientation as viser has it, and the angle (rad) that its picture is high."""
+    """A camera: position (3,), orientation in viser's convention, and vertical field of view (rad)."""
 
     position: F64
     wxyz: F64
@@ -33,11 +33,11 @@ class Station:
 
 
 def composed(rendered: U8, key: Key, *, light: bool, seen_m: float = 0.0) -> Image.Image:
-    """A picture with what explains it.
+    """A picture with its legend and scale.
 
     Args:
-        rendered: (h, w, 4), transparent where there is nothing. key: of its colours.
-        light: the background. seen_m: the picture's height at its middle, m; 0: no scale is drawn.
+        rendered: (h, w, 4), transparent where nothing is drawn. key: of its colours.
+        light: a light background. seen_m: height of the scene that the picture shows at its middle, m; 0: no scale.
     """
     picture = Image.new("RGB", (rendered.shape[1], rendered.shape[0]), BACKGROUND[light])
     seen = Image.fromarray(rendered)
@@ -66,10 +66,10 @@ def composed(rendered: U8, key: Key, *, light: bool, seen_m: float = 0.0) -> Ima
 
 
 def flight(path: F64, count: int, behind: float, above: float) -> list[Station]:
-    """`count` stations along a path of (n, 3) m, evenly spread over its length, looking ahead.
+    """`count` stations, evenly spaced along a path of (n, 3) m and looking ahead.
 
     Args:
-        behind, above: m, how far the camera stays behind the path and over it.
+        behind, above: m, how far the camera stays behind the walker and above the path.
     """
     walked = walked_m(path)
     even = np.arange(0.0, max(walked[-1], _STEP_M), _STEP_M)
@@ -80,7 +80,7 @@ def flight(path: F64, count: int, behind: float, above: float) -> list[Station]:
     begin, end = first - smooth[0], smooth[-1] - last
 
     def at(where: F64) -> F64:
-        """(k, 3) places at these distances, m, along the path, which goes on straight at its ends."""
+        """(k, 3) places at these distances, m, along the path, which continues straight beyond its ends."""
         inside = np.column_stack([np.interp(where, flown, smooth[:, axis]) for axis in range(3)])
         before, after = np.minimum(where, 0.0)[:, None], np.maximum(where - flown[-1], 0.0)[:, None]
         return np.asarray(inside + before * _unit(begin) + after * _unit(end))
@@ -91,7 +91,7 @@ def flight(path: F64, count: int, behind: float, above: float) -> list[Station]:
 
 
 def _unit(vector: F64) -> F64:
-    """Its direction, level; along x if it has none."""
+    """Horizontal direction of a vector; the x axis if it has none."""
     level = np.array([vector[0], vector[1], 0.0])
     length = float(np.linalg.norm(level))
     return level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])

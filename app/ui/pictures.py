@@ -24,12 +24,12 @@ from app.ui.widgets import Changes, Page, add_button, limited, notify_error, sho
 
 _LARGEST: Final = 8192
 _MOST_PIXELS: Final = 6144 * 4096
-"""What the browser sends must fit into a message (`app.server.access.MOST_OF_PICTURE`)."""
+"""Most pixels: the browser's picture must fit into a message (`app.server.access.MOST_OF_PICTURE`)."""
 _PATIENCE_S: Final = 120.0
 _RATE: Final = 25
-"""Pictures in a second of a flight."""
+"""Pictures per second of a flight."""
 _WAYS: Final = {"the walker's eyes": (0.0, 0.0), "behind and above": (5.0, 3.0)}
-"""How far behind the path and above it, m."""
+"""Distance behind the walker and above the path, m."""
 _MOST_SENT: Final = 500_000_000
 
 
@@ -37,7 +37,7 @@ class PicturesPanel:
     """Widgets in the caller's container.
 
     Args:
-        results: folder below which flights are saved. key: what the colours mean now, and whether the page is light.
+        results: folder below which flights are saved. key: the present key of colours, and whether the page is light.
     """
 
     def __init__(self, page: Page, results: Path, key: Callable[[], tuple[Key, bool]]) -> None:
@@ -95,7 +95,7 @@ class PicturesPanel:
         client.send_file_download(f"{self._name()}.png", png, save_immediately=True)
 
     def _png(self, rendered: U8, key: Key, light: bool, seen_m: float = 0.0) -> bytes:
-        """With a legend and a scale, if they are wanted. seen_m: as in `composed`."""
+        """The picture, with a legend and a scale if wanted. seen_m: as in `composed`."""
         if not self._explain.value:
             key, seen_m = Key(), 0.0
         file = io.BytesIO()
@@ -103,7 +103,7 @@ class PicturesPanel:
         return file.getvalue()
 
     def _rendered(self, client: viser.ClientHandle, station: Station) -> U8:
-        """(h, w, 4) what the browser sees from a station. Raises HemislamError: it sends no picture."""
+        """(h, w, 4) the browser's view from a station. Raises HemislamError: the browser sends no picture."""
         width, height = self._size()
         try:
             rendered: U8 = client.get_render(
@@ -144,7 +144,7 @@ class PicturesPanel:
         self._flying.start()
 
     def _take(self, client: viser.ClientHandle, stations: list[Station], file: Path) -> None:
-        """Write the pictures one after the other. If it is stopped, nothing is left."""
+        """Write the pictures one after another. If stopped, leave no file."""
         part, (key, light), session = file.with_suffix(".part"), self._key(), self._page.snapshot().session
         try:
             with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as pictures:

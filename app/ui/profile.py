@@ -1,4 +1,4 @@
-"""The profile along the walked path in the scene: x is the chainage, y how far left of the path, z the height."""
+"""The profile along the walked path in the scene: x is the chainage, y the offset to the left, z the height."""
 
 import contextlib
 from collections.abc import Callable, Iterable
@@ -15,7 +15,7 @@ from app.ui.nodes import add_exact_points, clear
 from app.ui.widgets import Changes, View
 
 _PERIOD_S: Final = 1.0
-"""The profile of a growing map is drawn again after this time at the earliest."""
+"""Least time between two drawings of the profile while the map grows."""
 
 
 def unrolled(parts: Iterable[tuple[F64, U8]], path: F64, slab: float) -> tuple[F64, U8]:
@@ -25,7 +25,7 @@ def unrolled(parts: Iterable[tuple[F64, U8]], path: F64, slab: float) -> tuple[F
         parts: (n, 3) points and their (n, 3) colours. path: (m, 2) m. slab: m, its width.
 
     Returns:
-        (k, 3) chainage, how far left, and height, m, and (k, 3) colours.
+        (k, 3) chainage, offset to the left and height, m, and (k, 3) colours.
     """
     found, colours = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
     for points, own in parts:
@@ -36,9 +36,9 @@ def unrolled(parts: Iterable[tuple[F64, U8]], path: F64, slab: float) -> tuple[F
 
 
 class ProfileNode:
-    """Takes the place of the map and all in it while a profile is shown.
+    """Replaces the map and everything in it while a profile is shown.
 
-    root: the node of the map. shown: gives the map's points with their colours.
+    root: the node of the map. shown: returns the map's points with their colours.
     """
 
     def __init__(
@@ -49,14 +49,14 @@ class ProfileNode:
         self._nodes: list[viser.PointCloudHandle] = []
 
     def draw(self, current: Snapshot, view: View) -> None:
-        """Show the profile that the view asks for, if it asks for one and somebody has walked."""
+        """Show the profile if the view asks for it and the walked path is long enough."""
         self._root.visible = not view.slab
         if not view.slab:
             clear(self._nodes)
             self._changes()
         elif self._changes(current.chunks, current.keyframe_poses, view):
             clear(self._nodes)
-            with contextlib.suppress(HemislamError):  # nobody has walked yet
+            with contextlib.suppress(HemislamError):  # the path is too short
                 path = strides(current.trajectory[:, :2])
                 points, colours = unrolled(self._shown(), path, view.slab)
                 if len(points):

@@ -1,4 +1,4 @@
-"""What the newest frame measured, as tiles; the last few hundred frames, or all, as plots."""
+"""Measurements of the newest frame as tiles, and of the last few hundred frames, or of all, as plots."""
 
 from typing import Any, Final
 
@@ -73,7 +73,7 @@ def state_tiles(snapshot: Snapshot, result: StepResult) -> list[Tile]:
 
 
 def times_html(snapshot: Snapshot, result: StepResult) -> str:
-    """Milliseconds per stage, which is also the legend of the plot below."""
+    """Milliseconds per stage; also the legend of the plot below."""
     took = result.timings_ms
     tiles = [
         Tile("frame", number(took.get("total", np.nan), 1), "ms"),
@@ -88,10 +88,11 @@ def _vector(v: F64, digits: int) -> str:
 
 
 def plotted(series: dict[str, F64], *names: str, worst: str = "") -> tuple[F64, ...]:
-    """Stamps and series for a plot of at most `HISTORY` frames; one zero each before the first frame.
+    """Stamps and series for a plot of at most `HISTORY` frames; before the first frame, a single zero each.
 
     Args:
-        worst: "" for the newest frames; else all frames in as many parts, of each that with the greatest `worst`.
+        worst: "" for the newest frames; a series name: all frames in `HISTORY` parts, and from each part the frame
+            with the greatest value of that series.
     """
     count = len(series.get("stamp_s", ()))
     if not count:
@@ -105,9 +106,9 @@ def plotted(series: dict[str, F64], *names: str, worst: str = "") -> tuple[F64, 
 
 
 def stacked_stages(series: dict[str, F64], worst: str = "") -> tuple[F64, ...]:
-    """Stamps, then running sums of the stages' milliseconds from the highest down, for filled areas; as `plotted`.
+    """As `plotted`: stamps, then cumulative sums of the stages' milliseconds, largest first, for filled areas.
 
-    Peaks are cut at four times the median: the first frame's would flatten all others.
+    Peaks are cut at four times the median: those of the first frames would flatten the rest.
     """
     stamps, *stages = plotted(series, *(f"{stage}_ms" for stage in STAGES), worst=worst)
     sums = np.cumsum(np.nan_to_num(np.array(stages)), axis=0)

@@ -1,4 +1,4 @@
-"""What depends on where browsers look from: the scale bar and compass of each, and ceilings."""
+"""Everything that depends on a browser's view: its scale bar and compass, and whether ceilings are hidden."""
 
 from typing import Final
 
@@ -11,15 +11,15 @@ from app.ui.html import panel
 from app.ui.widgets import PANEL_PERIOD_S, Changes, Page
 
 _LONGEST: Final = 0.16
-"""Of a bar, as a share of the picture's height."""
+"""Longest bar, as a share of the picture's height."""
 _STEPS: Final = (1.0, 2.0, 5.0, 10.0)
 
 _SHOWN_DEG, _HIDDEN_DEG = 12.0, 22.0
-"""Ceilings come back where one looks down by less than the first, and go where it is more than the second."""
+"""Ceilings appear if the view slopes down by less than the first angle, and vanish if by more than the second."""
 
 
 def bar(seen_m: float) -> float:
-    """The longest bar of 1, 2 or 5 times a power of ten metres that is short enough; seen_m: the picture's height."""
+    """The longest bar of 1, 2 or 5 times a power of ten metres that fits; seen_m: the picture's height in the scene."""
     power = 10.0 ** np.floor(np.log10(_LONGEST * seen_m))
     return float(max(step * power for step in _STEPS if step * power <= _LONGEST * seen_m))
 
@@ -29,10 +29,10 @@ def length_text(metres: float) -> str:
 
 
 def scale_html(position: F64, look_at: F64, fov: float, north: F64 | None = None, *, needle: bool = True) -> str:
-    """Of a camera, in the scene: a bar for what it looks at, and which way north points as it sees it.
+    """Scale bar at the point that a camera looks at, and the direction of north in its picture.
 
-    north: (2 or more,), its direction in the map; None: unknown, the map's x stands for it. needle: whether there are
-    directions at all, which a profile along a bent path has not.
+    north: (2 or more,), its direction in the map; None: unknown, and the map's x axis is shown instead. needle: whether
+    to show a direction; a profile along a bent path has none.
     """
     ahead = look_at - position
     seen_m = 2 * float(np.linalg.norm(ahead)) * float(np.tan(fov / 2))
@@ -53,7 +53,7 @@ class ScaleBars:
         self._bars: dict[int, tuple[viser.GuiHtmlHandle, Changes]] = {}
 
     def draw(self, current: Snapshot) -> None:
-        """Called often; sends what differs, at most a few times a second."""
+        """Send changes, at most a few times a second. Called often."""
         clients = self._page.server.get_clients()
         found, needle = current.earth.found, not current.clip.unrolled
         north = np.array(found.reference.rotation)[1] if found is not None else None
@@ -70,14 +70,14 @@ class ScaleBars:
 
 
 class Looks:
-    """How browsers look at the scene, which is one for all of them."""
+    """The views of all browsers, which share one scene."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._above = server, True
 
     @property
     def from_above(self) -> bool:
-        """Whether any looks down from above: then ceilings would be in the way."""
+        """Whether any browser looks from above, where ceilings would hide the rooms."""
         slopes = []
         for client in self._server.get_clients().values():
             back = np.array(client.camera.position) - client.camera.look_at

@@ -1,7 +1,7 @@
 """The scene: everything of a snapshot that is drawn in space, z up, in metres.
 
-All nodes hang below one frame. To follow the sensor, that frame is shifted so that the sensor stays
-at the origin: the camera of every browser is left to its user, who may orbit and zoom while following.
+All nodes are children of one frame. To follow the sensor, this frame is shifted so that the sensor stays at the origin.
+Cameras are left alone, so users may orbit and zoom while following.
 """
 
 from typing import Final
@@ -22,22 +22,22 @@ from app.ui.widgets import ROOT, Changes, View
 
 _FOLLOWED_M: Final = 1e-3
 _FOLLOW_RATE: Final = 0.3
-"""Share of the way to the sensor that the view moves per drawing, so that a person's sway does not shake it."""
+"""Share of the distance to the sensor that the view moves per drawing, so that a walker's sway does not shake it."""
 _FOLLOW_JUMP_M: Final = 4.0
 _GROUND_BEFORE_SEEN_M: Final = -1.2
 _GRID_STEP_M: Final = 0.03
 _GRID: Final = {False: ((42, 48, 58), (62, 72, 88)), True: ((214, 220, 228), (186, 195, 207))}
-"""Colours of its cells and of every fifth line, on a dark and on a light background."""
+"""Colours of the grid's lines and of every fifth line, on a dark and on a light background."""
 _EYE_STEP_M: Final = 1.0
 _FRAMED_AGAIN: Final = 1.05
-"""The view of the whole map is chosen again when the number of keyframes has grown by this factor."""
+"""The view of the whole map is fitted again after the number of keyframes has grown by this factor."""
 
 
 class Scene:
-    """Draws snapshots on a viser server, sending differences only.
+    """Draws snapshots on a viser server, sending only changes.
 
     Attributes:
-        chunks: the map as drawn. framing: keeps it in the picture.
+        chunks: the map as drawn. framing: keeps the map in the picture.
     """
 
     def __init__(self, server: viser.ViserServer, budget: int = POINT_BUDGET) -> None:
@@ -60,7 +60,7 @@ class Scene:
             position=(0.0, 0.0, _GROUND_BEFORE_SEEN_M),
         )
         self._session = -1
-        self._seen = False  # a frame of this session
+        self._seen = False  # whether a frame of this session was drawn
         self._changes = Changes()
         self.chunks = MapChunks(scene, f"{ROOT}/keyframes", budget)
         self._sensor = SensorScene(scene, f"{ROOT}/sensor")
@@ -72,12 +72,12 @@ class Scene:
 
     @property
     def offset(self) -> F64:
-        """(3,) m, where the map's origin is in the scene: moved against the sensor while that is followed."""
+        """(3,) m, position of the map's origin in the scene; moves opposite to the sensor while following."""
         return np.array(self._root.position)
 
     @property
     def eyes(self) -> frozenset[tuple[float, ...]]:
-        """(x, y, z) of every camera in the map, coarsely; none while all of the map is drawn anyway."""
+        """(x, y, z) of every camera in the map, rounded; empty while the whole map is drawn anyway."""
         if not self.chunks.partial:
             return frozenset()
         cameras = (client.camera for client in self._server.get_clients().values())
@@ -85,7 +85,7 @@ class Scene:
         return frozenset(tuple(np.round(place / _EYE_STEP_M) * _EYE_STEP_M) for place in places)
 
     def draw(self, current: Snapshot, view: View) -> bool:
-        """Bring the scene up to `current`; False if it is to be called again for the rest, even if nothing changes."""
+        """Update the scene to `current`. Returns False if it must be called again, even without a new snapshot."""
         limits = self.chunks.limits
         with self._server.atomic():
             self._draw_scan(current, view)
@@ -100,7 +100,7 @@ class Scene:
         return self._look(current, view) and self.chunks.limits is limits and self.chunks.settled
 
     def _draw_scan(self, current: Snapshot, view: View) -> None:
-        """What is measured just now. It does not wait for the map."""
+        """Draw the newest scan, without waiting for the map."""
         recording, result = current.recording, current.result
         start_ns = recording.start_ns if recording else 0
         if current.session != self._session:
@@ -116,14 +116,14 @@ class Scene:
             ends = chosen_ends(limits, view.colour_by, view.ends)
             self._sensor.draw(result, current.params, view, ends, start_ns)
         z = self._sensor.ground_z
-        if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it shiver
+        if z is not None and abs(z - self._grid.position[2]) > _GRID_STEP_M:  # smaller steps would make it jitter
             self._grid.position = (0.0, 0.0, z)
         if view.follow:
             self._follow(result.T_map_imu[:3, 3], jump=not self._seen)
         self._seen = True
 
     def _look(self, current: Snapshot, view: View) -> bool:
-        """Keep the map or the sensor in the picture; False while cameras are on their way."""
+        """Keep the map or the sensor in the picture. Returns False while cameras are on their way."""
         if view.follow != self._followed:
             self._followed = view.follow
             if view.follow:
@@ -138,5 +138,5 @@ class Scene:
         behind = -position - self._root.position
         if jump or float(np.linalg.norm(behind)) > _FOLLOW_JUMP_M:
             self._root.position = -position
-        elif float(np.linalg.norm(behind)) > _FOLLOWED_M:  # else it would never arrive, and the page draw for ever
+        elif float(np.linalg.norm(behind)) > _FOLLOWED_M:  # otherwise drawing would never end
             self._root.position = self._root.position + _FOLLOW_RATE * behind

@@ -1,4 +1,4 @@
-"""The sensor and what it sees just now: scan, field of view, seed wedge, ground plane."""
+"""The sensor and its newest scan, with field of view, seed wedge and ground plane."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -15,17 +15,17 @@ from app.ui.nodes import NO_COLOURS, NO_LINES, NO_POINTS, add_lines, add_points,
 from app.ui.widgets import View
 
 MOST_SCAN_POINTS: Final = 30_000
-"""Of a denser scan every k-th point is drawn. A scan is sent to every browser with every frame: 2.7 MB/s at 10 Hz."""
+"""Of a denser scan, every k-th point is drawn. Every browser gets every scan: 2.7 MB/s at 10 Hz."""
 
 _PATCH_RADIUS_M: Final = 2.5
 SCAN_POINT_SCALE: Final = 1.3
-"""The current scan has larger points than the map, to stand out."""
+"""The current scan has larger points than the map so that it stands out."""
 _TUNED_POINT_SCALE: Final = 2.0
-"""While the ground is tuned."""
+"""The scale while the ground is tuned."""
 
 
 def shown_of(count: int) -> slice:
-    """Every k-th of a scan's points, with the smallest k that leaves at most `MOST_SCAN_POINTS`."""
+    """Every k-th point of a scan, with the smallest k that leaves at most `MOST_SCAN_POINTS`."""
     return slice(0, count, max(1, -(-count // MOST_SCAN_POINTS)))
 
 
@@ -55,7 +55,7 @@ class SensorScene:
         self.ground_z: float | None = None
 
     def draw(self, result: StepResult, params: Params, view: View, limits: Mapping[str, Limits], start_ns: int) -> None:
-        """Draw `result`. Of a frame that was only labelled again viser sends only colours, since the rest is the same.
+        """Draw `result`. If a frame was only relabelled, viser sends only colours, since the rest is unchanged.
 
         Args:
             limits: ends of the colour maps by mode. start_ns: of the recording.
@@ -67,7 +67,7 @@ class SensorScene:
             shown = shown[view.clip.holds(lie.moved(T_map_lidar, cloud.points[shown]))]
         if len(shown):  # the page cannot draw a cloud without points: it is hidden instead
             points = PointSet.of(cloud, shown, T_map_lidar, (result.stamp_ns - start_ns) * 1e-9)
-            by = LABEL if view.tuning or view.colour_by == LOOK else view.colour_by  # what is tuned stands out
+            by = LABEL if view.tuning or view.colour_by == LOOK else view.colour_by  # labels stand out while tuning
             self._scan.colors = colours(points, by, limits)
             self._scan.points = points.points.astype(np.float16)
         place(self._imu, result.T_map_imu)

@@ -1,6 +1,7 @@
-"""Light on the points of a keyframe, so that a map reads at first sight: flat things by their slope, edges darker.
+"""Shading of a keyframe's points that makes a map easier to read: surfaces by their orientation, edges darker.
 
-Computed once per keyframe, where it is drawn first, by cells that grow with their distance as the gaps of a scan do.
+Computed once per keyframe, at the pose where it is first drawn, in cells that grow with distance like the gaps
+between the points of a scan.
 """
 
 from typing import Final
@@ -10,19 +11,19 @@ import numpy as np
 from app.slam.types import F32, F64
 
 _CELL: Final = 0.12
-"""Edge of a cell over its distance from the sensor, at least; up to twice that."""
+"""Least ratio of a cell's edge to its distance from the sensor; the ratio is at most twice this."""
 _NEAR_M: Final = 2.5
 _LEAST_POINTS: Final = 6
-"""Cells with fewer have no slope."""
+"""In cells with fewer points, no plane is fitted."""
 _SUN: Final[F64] = np.array([0.37, -0.53, 0.76])
-"""Unit vector towards the light in the map: floors are brightest, walls at right angles to each other differ."""
+"""Unit vector towards the light in the map: floors are brightest, and perpendicular walls differ."""
 _LEAST: Final = 0.62
 _EDGE: Final = 0.3
-"""How much darker points are that lie on no surface."""
+"""How much darker points are that do not lie on a surface."""
 
 
 def light(points: F32, T_map_lidar: F64) -> F32:
-    """(n,) brightness up to 1 of (n, 3) points in the LiDAR frame, by the plane through all points of their cell."""
+    """(n,) brightness up to 1 of (n, 3) points in the LiDAR frame, from the plane through the points of each cell."""
     if not len(points):
         return np.ones(0, np.float32)
     cell, counts = _cells(points)
@@ -41,7 +42,7 @@ def light(points: F32, T_map_lidar: F64) -> F32:
 
 
 def _cells(points: F32) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) the cell of each point, and (m,) how many points each has."""
+    """(n,) cell of each point, and (m,) number of points per cell."""
     distance = np.maximum(np.linalg.norm(points, axis=1), _NEAR_M)
     level = np.floor(np.log2(distance / _NEAR_M))
     at = np.floor(points / (_CELL * _NEAR_M * np.exp2(level))[:, None]).astype(np.int64) + (1 << 13)

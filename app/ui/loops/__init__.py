@@ -1,4 +1,4 @@
-"""Loops in the page: arches in the scene (`edges`), the `table` of candidates, the `inspector` of one, and `edits`.
+"""Loops in the page: arches in the scene (`edges`), the `table` of candidates, the `inspector` of a loop, and `edits`.
 
-`panel` puts them together.
+`panel` combines them.
 """

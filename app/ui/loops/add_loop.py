@@ -1,4 +1,4 @@
-"""Adding a loop by hand: which two keyframes, from which guess, and whether they are registered."""
+"""Adding a loop by hand: choose two keyframes, an initial guess, and whether to register them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,22 +23,22 @@ from app.ui.nodes import add_exact_points, clear
 from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, limited, show
 
 _REST_S: Final = 0.4
-"""The guess is tried after the gizmo has rested this long."""
+"""The guess is tried after the gizmo has not moved for this long."""
 _PICK, _FIRST, _SECOND = "Pick in the scene", "Click a keyframe …", "Click the other one …"
 _FROM_M: Final = 12.0
 _DOT: Final = (236, 240, 246)
 _REACH: Final = 5
-"""Keyframes before and after one whose points are shown around it."""
+"""The points of this many keyframes before and after a keyframe are shown with its own."""
 _NODE: Final = f"{ROOT}/add_loop"
 
 
 def upright(T_map_imu: F64) -> F64:
-    """(4, 4) T_map_upright: at the keyframe, with the map's axes."""
+    """(4, 4) T_map_upright: a frame at the keyframe's position with the map's axes."""
     return lie.transform(np.eye(3), T_map_imu[:3, 3])
 
 
 def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int, ceilings: bool) -> F32:
-    """(n, 3) points around a keyframe in its upright frame, from the keyframes before and after it."""
+    """(n, 3) points of a keyframe and its neighbours in time, in the keyframe's upright frame."""
     near = [chunk for chunk in chunks if abs(chunk.index - index) <= _REACH and chunk.index < len(poses)]
     share = MOST_POINTS // max(len(near), 1)
     parts = [np.empty((0, 3))]
@@ -51,11 +51,11 @@ def surroundings(chunks: tuple[Chunk, ...], poses: F64, index: int, ceilings: bo
 
 @dataclass(slots=True)
 class Nudging:
-    """Two clouds of which a person moves the newer one, by arrows and rings.
+    """Two clouds; the user moves the newer one by arrows and rings.
 
     Attributes:
-        T_map_older, T_map_newer: (4, 4) of the keyframes when it began.
-        guess: where the newer cloud was last; not sent while it is being moved.
+        T_map_older, T_map_newer: (4, 4) poses of the keyframes at the start.
+        guess: the last pose of the newer cloud; not sent while it is being moved.
     """
 
     pair: Pair
@@ -71,7 +71,7 @@ class Nudging:
 
     @property
     def T_older_newer(self) -> F64:
-        """(4, 4) of the keyframes, with the newer one moved as its cloud was."""
+        """(4, 4) between the keyframes, with the newer one moved like its cloud."""
         return lie.inverse(self.T_map_older) @ self.T_map @ lie.inverse(upright(self.T_map_newer)) @ self.T_map_newer
 
 
@@ -79,8 +79,8 @@ class AddLoopPanel:
     """Widgets in the caller's container.
 
     Args:
-        propose: takes the edit to be tried. fly: moves a browser's camera to look at a place (3,) of the map from
-            this many metres away.
+        propose: takes the edit to try. fly: moves a browser's camera to look at a place (3,) of the map from a
+            distance in metres.
     """
 
     def __init__(
@@ -89,11 +89,11 @@ class AddLoopPanel:
         gui = page.gui
         self._page, self._propose, self._fly = page, propose, fly
         self._overlay = Overlay(page.scene, f"{_NODE}/clouds")
-        self._dots: list[viser.PointCloudHandle] = []  # one node of them, or none
+        self._dots: list[viser.PointCloudHandle] = []  # one node or none
         self._changes = Changes()  # of the dots
         self._picked: list[int] | None = None
         self._nudging: Nudging | None = None
-        self._tried = False  # with keyframes that cannot be
+        self._tried = False  # whether the user tried an impossible pair
         gui.add_html(panel("text", "Connect two keyframes that see the same place, even if the search found no loop."))
         self._older = limited(gui.add_number("older keyframe", 0, min=0, step=1))
         self._newer = limited(gui.add_number("newer keyframe", 0, min=0, step=1))
@@ -127,7 +127,7 @@ class AddLoopPanel:
         show(self._newer, pair[1])
 
     def done(self) -> None:
-        """Remove the clouds and the gizmo, after a decision."""
+        """Remove the clouds and the gizmo after a decision."""
         show(self._nudge, False)
 
     def suggest(self) -> None:
@@ -137,7 +137,7 @@ class AddLoopPanel:
             self._propose(Add(older, newer, self._guess(), self._register.value))
 
     def _is_possible(self, count: int) -> bool:
-        """Whether the two are among the first `count` keyframes; if something is to be done with them, says so."""
+        """Whether both are among the first `count` keyframes, in order; if not, tells a user who wants to use them."""
         older, newer = self.pair
         good = 0 <= older < newer < count
         self._tried &= not good
@@ -146,7 +146,7 @@ class AddLoopPanel:
         return good
 
     def pick(self, origin: F64, direction: F64) -> None:
-        """A click while picking; the ray is in the map."""
+        """Handle a click while picking; the ray is in the map frame."""
         picked, positions = self._picked, self._page.snapshot().keyframe_poses[:, :3, 3]
         index = nearest(positions[:, None], origin, direction, within=np.radians(3.0))
         if picked is None or index is None or index in picked:
@@ -157,7 +157,7 @@ class AddLoopPanel:
             self._picked = None
 
     def draw_scene(self, snapshot: Snapshot, view: View) -> None:
-        """Called by the drawing thread, often: dots to pick from, the two clouds, and the guess once it rests."""
+        """Draw the dots to pick and the two clouds; try the guess once it rests. Called often by the drawing thread."""
         self._draw_picking(snapshot)
         poses, pair, nudging = snapshot.keyframe_poses, self.pair, self._nudging
         wanted = self._is_possible(len(poses)) and self._nudge.value
@@ -190,7 +190,7 @@ class AddLoopPanel:
         return nudging
 
     def _guess(self) -> tuple[tuple[float, ...], ...] | None:
-        """T_older_newer of the IMU frames as the gizmo has it; None: as the graph has it."""
+        """T_older_newer of the IMU frames according to the gizmo; None: use the pose in the graph."""
         nudging = self._nudging
         return rows(nudging.T_older_newer) if nudging is not None and nudging.pair == self.pair else None
 

@@ -1,7 +1,7 @@
-"""Loops in the scene: an arch from keyframe to keyframe, and which one a click meant.
+"""Loops in the scene: an arch from keyframe to keyframe, and the arch that a click points at.
 
-A good loop ties keyframes at nearly the same place, and a straight line would be too short to see:
-every edge rises to a knob above its middle.
+A good loop ties keyframes at nearly the same place, where a straight line would be too short to see. So every edge
+rises to a knob above its middle.
 """
 
 from typing import Final
@@ -19,7 +19,7 @@ from app.ui.nodes import add_exact_points, add_lines
 from app.ui.widgets import Changes
 
 _RISE: Final = (0.7, 0.12)
-"""Height of a knob above the edge's middle: m, and its share of the edge's length."""
+"""Height of a knob above the edge's middle: m, plus a share of the edge's length."""
 CHOSEN: Final[dict[bool, Rgb]] = {False: (255, 255, 255), True: (16, 18, 22)}
 """Colour of the chosen loop on a dark and on a light background."""
 _CHOSEN_WIDTH: Final = 5.0
@@ -37,10 +37,10 @@ def arches(edges: list[LoopEdge], poses: F64) -> F32:
 
 
 def nearest(lines: npt.NDArray[np.floating], origin: F64, direction: F64, within: float = _PICK_RAD) -> int | None:
-    """Which of (n, k, 3) polylines passes nearest to a ray, as seen from its origin.
+    """Index of the one of (n, k, 3) polylines that passes nearest to a ray, as seen from the ray's origin.
 
     Args:
-        origin: (3,). direction: (3,). within: rad, beyond which nothing was meant.
+        origin: (3,). direction: (3,). within: rad, largest angle between the ray and a polyline.
     """
     if not len(lines):
         return None
@@ -55,7 +55,7 @@ def nearest(lines: npt.NDArray[np.floating], origin: F64, direction: F64, within
 
 
 class LoopEdges:
-    """Arches and knobs of the loops shown: per kind, in the graph or not, a node of lines and one of points."""
+    """Arches and knobs of the loops shown: one node of lines and one of points per kind, in the graph or not."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene = scene
@@ -68,7 +68,7 @@ class LoopEdges:
     def draw(
         self, edges: tuple[LoopEdge, ...], poses: F64, shown: frozenset[str], chosen: Pair | None, light: bool
     ) -> None:
-        """Draw the edges of the kinds `shown` and the chosen one, sending what differs.
+        """Draw the edges of the kinds `shown` and the chosen edge, sending only changes.
 
         Args:
             poses: (k, 4, 4) T_map_imu of the keyframes; edges of later ones are left out.

@@ -1,4 +1,4 @@
-"""Editing loops: what an edit would move is shown as a ghost, and what it moved; undo, redo, files."""
+"""Editing loops: the effect of an edit, before and after, shown as a ghost trajectory; undo, redo, files."""
 
 from collections.abc import Callable
 from typing import Final
@@ -19,15 +19,15 @@ from app.ui.widgets import ROOT, Changes, Edit, Page, add_button, add_command, a
 
 _REST_S: Final = 0.3
 _GHOST: Final[dict[bool, Rgb]] = {False: (255, 232, 70), True: (120, 90, 0)}
-"""On a dark and on a light background: yellow, which every kind of colour vision tells from path and edited loops."""
+"""Yellow on a dark and on a light background: for every kind of colour vision unlike the path and edited loops."""
 _STICK: Final[Rgb] = (150, 140, 100)
 _LEAST_SHIFT_M: Final = 0.005
 _SEEN: Final = 0.03
-"""Shifts are enlarged until the largest is nearly this share of the walk's extent: real ones are rarely seen."""
+"""Shifts are enlarged until the largest is nearly this share of the walk's extent: to scale, few would be visible."""
 
 
 def enlarged(shifts: F64, extent: float) -> int:
-    """1, 2, 5, 10 … 100 times, as (k, 3) shifts (m) are drawn on a walk of that extent (m); 0: too small to draw."""
+    """Factor 1, 2, 5, 10 … 100 by which (k, 3) shifts (m) are drawn on a walk of this extent (m); 0: too small."""
     largest = float(np.linalg.norm(shifts, axis=1).max(initial=0.0))
     if largest < _LEAST_SHIFT_M:
         return 0
@@ -35,10 +35,10 @@ def enlarged(shifts: F64, extent: float) -> int:
 
 
 class Ghost:
-    """The trajectory as an edit would make it, or as it was before one, tied by sticks to the present one.
+    """The trajectory that an edit would produce, or the one before an edit, tied by lines to the present one.
 
     Attributes:
-        key: colour and name of what is drawn, for the legend; none while nothing is.
+        key: colour and name for the legend; empty while nothing is drawn.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
@@ -48,7 +48,7 @@ class Ghost:
         self._changes = Changes()
 
     def draw(self, other: F64 | None, present: F64, name: str, light: bool) -> None:
-        """Show (k, 4, 4) poses beside the present ones, its shifts enlarged; None removes them."""
+        """Show (k, 4, 4) poses beside the present ones, with enlarged shifts; None removes them."""
         if not self._changes(other, present if other is not None else None, name, light):
             return
         clear(self._nodes)
@@ -66,18 +66,18 @@ class Ghost:
 
 
 def decided(command: LoopEdit) -> Pair | None:
-    """The loop on whose verdict the edit is."""
+    """The loop whose verdict the edit decides; None for another kind of edit."""
     return command.pair if isinstance(command, Accept | Reject) else None
 
 
 class Proposal:
-    """What the edit under consideration would change, with Apply and Cancel; then what it did, with Undo.
+    """The effect that a proposed edit would have, with Apply and Cancel; then its actual effect, with Undo.
 
     Attributes:
-        command: the edit under consideration. preview: what the engine says of it, or of the one that is only shown.
+        command: the proposed edit. preview: the engine's answer on it, or on an edit that is only previewed.
         ghost: the trajectory beside the present one.
-        last: the edit applied last, until it is undone or another one follows.
-        happened: HTML of what the last edit, its undo or its redo did. about: the loop whose verdict it was.
+        last: the last applied edit, until it is undone or another edit follows.
+        happened: HTML that says what the last edit, undo or redo did. about: the loop whose verdict it changed.
     """
 
     def __init__(self, page: Page, applied: Callable[[LoopEdit], None]) -> None:
@@ -95,12 +95,12 @@ class Proposal:
             self._undo = _undo_button(page)
         self.command: LoopEdit | None = None
         self.preview: Preview | None = None
-        self._asked: tuple[LoopEdit | None, object] = None, None  # tried, and of which loops
+        self._asked: tuple[LoopEdit | None, object] = None, None  # the edit tried, and the loops then
         self.last: LoopEdit | None = None
         self.happened = ""
         self.about: Pair | None = None
-        self._before: F64 | None = None  # the poses before it, until another loop is looked at
-        self._after: tuple[LoopEdge, ...] | None = None  # the loops with it, since a snapshot has had it
+        self._before: F64 | None = None  # poses before it, until another loop is chosen
+        self._after: tuple[LoopEdge, ...] | None = None  # the loops with it, once a snapshot has them
         self._seen = Snapshot()
         self._last_notice = 0
         self._changes = Changes()
@@ -123,7 +123,7 @@ class Proposal:
             self.happened = ""
 
     def see(self, snapshot: Snapshot) -> None:
-        """Note what the last edit did, once the snapshot has it, or that it was undone or redone."""
+        """Record the effect of the last edit once the snapshot contains it, or of an undo or redo."""
         seen, self._seen = self._seen, snapshot
         edits, now, before, poses = seen.loops.undo, snapshot.loops.undo, seen.keyframe_poses, snapshot.keyframe_poses
         last = self.last
@@ -140,11 +140,11 @@ class Proposal:
             self.last, self.happened = None, ""
 
     def draw(self, snapshot: Snapshot, looked_at: LoopEdit | None, chosen: Pair | None, light: bool) -> None:
-        """Show the edit under consideration and the one before.
+        """Show the proposed edit and the last applied one.
 
         Args:
-            looked_at: what is only shown, while nothing is considered.
-            chosen: a loop of which `VerdictPanel` says what happened. light: a light background.
+            looked_at: an edit to preview while none is proposed.
+            chosen: the loop for which `VerdictPanel` shows what happened. light: a light background.
         """
         self._done.visible = bool(self.happened) and (self.about is None or self.about != chosen)
         self._undo.visible = self.last is not None
@@ -180,10 +180,10 @@ class Proposal:
 
 
 class VerdictPanel:
-    """Accept, reject and weight of the chosen loop.
+    """Buttons to accept or reject the chosen loop, and its weight.
 
     Args:
-        apply: applies an edit at once; Undo takes it back. propose: shows first what it would change.
+        apply: applies an edit at once; Undo reverts it. propose: first shows what an edit would change.
     """
 
     def __init__(self, page: Page, apply: Callable[[LoopEdit], None], propose: Callable[[LoopEdit], None]) -> None:
@@ -200,7 +200,7 @@ class VerdictPanel:
         self._reject = add_button(
             gui, "Reject it", lambda _: self._decide(Reject), viser.Icon.THUMB_DOWN, color="red", hint=hint
         )
-        # In the same place, so that the way back is under the mouse. Accepting again would make a loop of its own.
+        # In the same place, so that it is under the mouse. Accepting again would add the loop as a factor of its own.
         self._undo = _undo_button(page)
         self._reason = gui.add_html("")
         self._words = gui.add_html("")
@@ -218,8 +218,8 @@ class VerdictPanel:
         """Show the loop's verdict.
 
         Args:
-            weighing: the weight under consideration. words: what the last edit did, or the other verdict would do.
-            undo: whether that verdict was the last edit, so that the way back is to undo it.
+            weighing: the proposed weight. words: what the last edit did, or what the other verdict would do.
+            undo: whether the verdict was the last edit, so that Undo reverts it.
         """
         self._pair = edge.pair if edge is not None else None
         if edge is None:

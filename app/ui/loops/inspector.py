@@ -1,4 +1,4 @@
-"""Everything about one loop: its numbers, its contexts, its residuals, and both submaps superimposed."""
+"""Everything about one loop: its numbers, its Scan Contexts, its residuals, and both submaps superimposed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from app.ui.widgets import ROOT, Changes, Page, View, by_user, chart, show
 
 FLY, SEEK, CLOSE = "fly there", "frame", "close"
 UNSEEN: Final = (104, 108, 116)
-"""Grey: never seen, so it counts for neither side."""
+"""Grey for unseen cells, which do not count in the comparison."""
 _DISC: Final = 300
 _GAP: Final = 20
 _BARS: Final = 30
@@ -33,19 +33,19 @@ _NO_CONTEXTS: Final = np.zeros((1, 1, 4), np.uint8)
 
 
 def on_the_way(T_from: F64, T_to: F64, share: float) -> F64:
-    """(4, 4) between two poses: the position moves in a straight line, the rotation about one axis. share: 0 to 1."""
+    """(4, 4) interpolated between two poses: position on a straight line, rotation about one axis. share: 0 to 1."""
     turn = lie.log(T_from[:3, :3].T @ T_to[:3, :3])
     return lie.transform(T_from[:3, :3] @ lie.exp(share * turn), (1 - share) * T_from[:3, 3] + share * T_to[:3, 3])
 
 
 def without_ceiling(points: F32) -> F32:
-    """(n, 3) points of a submap, z up and its keyframe at the origin, without the ceiling above that."""
+    """(n, 3) points of a submap without the ceiling; z is up, and the keyframe is at the origin."""
     return points[below_ceiling(points, np.full(len(points), NON_GROUND, np.uint8), np.array([0.0, 0.0, 1.0]))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairing:
-    """Two clouds to be superimposed, each in a frame of its own.
+    """Two clouds to superimpose, each in its own frame.
 
     Attributes:
         older, newer: (n, 3). T_map_older: (4, 4) of the older cloud's frame.
@@ -57,7 +57,7 @@ class Pairing:
 
 
 class Overlay:
-    """The two clouds as nodes below `root`; their points are sent once, a moved slider sends a pose."""
+    """The two clouds as nodes below `root`. Their points are sent once; moving the slider sends only a pose."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene, self._root = scene, root
@@ -93,7 +93,7 @@ class Inspector:
         self._pairing: Pairing | None = None
         self._clouds: tuple[LoopDetail, bool, F32, F32] | None = None
         self._changes = Changes()
-        self._alone_before: bool | None = None  # while the map is shown in place of the submaps
+        self._alone_before: bool | None = None  # the user's choice, while the map replaces the submaps
         self._evidence = gui.add_html("")
         self._go = gui.add_button_group(
             "go", (FLY, SEEK, CLOSE), hint="Fly to the loop, go to the frame of its verdict, or close it."
@@ -120,20 +120,20 @@ class Inspector:
         self._residuals = chart(gui, (np.zeros(1),) * 3, [line | {"fill": "#40b8f080"}, limit])
 
     def show_map(self) -> None:
-        """Show what became of the map in place of the submaps, until another loop is chosen or `alone` is."""
+        """Show the edited map in place of the submaps, until another loop or `alone` is chosen."""
         if self._alone_before is None:
             self._alone_before = self._alone.value
         show(self._alone, False)
 
     def hide_map(self) -> None:
-        """As the user had it before `show_map`."""
+        """Restore the user's choice from before `show_map`."""
         if self._alone_before is not None:
             show(self._alone, self._alone_before)
         self._alone_before = None
 
     @property
     def shown(self) -> bool:
-        """Whether two submaps are in the scene."""
+        """Whether the two submaps are in the scene."""
         return self._pairing is not None
 
     @property
@@ -141,7 +141,7 @@ class Inspector:
         return self.shown and self._alone.value
 
     def draw(self, snapshot: Snapshot, edge: LoopEdge | None) -> None:
-        """Show the loop `edge`; its details come from the engine a moment later."""
+        """Show the loop `edge`; the engine delivers its details a moment later."""
         detail = _detail(snapshot, edge.pair if edge is not None else None)
         if not self._changes(detail, edge, snapshot.params.loops):
             return
@@ -167,7 +167,7 @@ class Inspector:
         self._residuals.scales = {"x": {"time": False}, "y": {"range": (0.0, float(outline[1].max()))}}
 
     def draw_scene(self, snapshot: Snapshot, chosen: Pair | None, view: View) -> None:
-        """Place the submaps in the scene, as far between the two poses as the slider is."""
+        """Place the submaps in the scene; the slider interpolates between the two poses."""
         detail, poses = _detail(snapshot, chosen), snapshot.keyframe_poses
         if self._alone_before is not None and not self._alone.value:
             detail = None
@@ -192,10 +192,10 @@ def _detail(snapshot: Snapshot, pair: Pair | None) -> LoopDetail | None:
 
 # --- charts --------------------------------------------------------------------------------------
 def disc(context: F32, turn: float = 0.0) -> U8:
-    """(_DISC, _DISC, 4) a context as seen from above, x to the right and y up; clear outside its radius.
+    """(_DISC, _DISC, 4) image of a context from above, x to the right and y up; transparent outside its radius.
 
     Args:
-        context: (rings, sectors), nan where never seen. turn: rad, by which it is turned anticlockwise.
+        context: (rings, sectors), NaN where unseen. turn: rad, anticlockwise rotation.
     """
     rings, sectors = context.shape
     at = (np.arange(_DISC) + 0.5) / (_DISC / 2) - 1.0
@@ -214,28 +214,28 @@ def disc(context: F32, turn: float = 0.0) -> U8:
 
 
 def contexts_image(older: F32, newer: F32, turn: float) -> U8:
-    """Both contexts side by side, the newer one turned by `turn` (rad) to match the older one."""
+    """Image of both contexts side by side, the newer one rotated by `turn` (rad) to match the older one."""
     gap = np.zeros((_DISC, _GAP, 4), np.uint8)
     return np.concatenate((disc(older), gap, disc(newer, turn)), axis=1)
 
 
 def best_yaw(shift_distances: F64) -> float:
-    """rad: the heading of the newer keyframe in the older one's frame at which their contexts are most alike."""
+    """Heading (rad) of the newer keyframe in the older one's frame at which their contexts are most similar."""
     return float(YAWS[int(np.argmin(shift_distances))])
 
 
 def shift_curve(shift_distances: F64, limit: float) -> tuple[F64, F64, F64]:
-    """Degrees by which the newer context is turned, the contexts' distance there, and its limit, (sectors,) each."""
+    """Rotation of the newer context (degrees), distance of the contexts, and its limit, (sectors,) each."""
     order = np.argsort(YAWS)
     distances = np.asarray(shift_distances, dtype=np.float64)[order]
     return np.degrees(YAWS[order]), distances, np.full(len(distances), limit)
 
 
 def histogram(residuals: F64, limit: float) -> tuple[F64, F64, F64]:
-    """How many points are how far from the other submap's surface, as the outline of bars over mm.
+    """Histogram of the points' distances (mm) to the other submap's surface, as the outline of its bars.
 
     Args:
-        residuals: (k,) m. limit: m; it lies between two bars, where the third series has its only numbers.
+        residuals: (k,) m. limit: m, drawn between two bars by the third series, which is NaN elsewhere.
     """
     values = 1000 * np.abs(residuals[np.isfinite(residuals)])
     high = max(float(np.percentile(values, 99)), 1100 * limit) if len(values) else 1100 * limit

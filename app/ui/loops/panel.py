@@ -1,4 +1,4 @@
-"""The Loops tab, and loops in the scene: what is chosen and what is shown."""
+"""The Loops tab, and loops in the scene: which loop is chosen, and which are shown."""
 
 import time
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from app.ui.widgets import ROOT, Changes, Page, View, add_button, add_command
 _STEPS: Final = 14
 _STEP_S: Final = 0.03
 _LEAST_SLOPE: Final = 0.9
-"""Least steepness of the view downwards (z over the horizontal), to see into a building."""
+"""Least downward slope of the view (vertical over horizontal), to see into a building."""
 _SOLVE_HINT: Final = (
     "Levenberg-Marquardt over all factors, instead of one keyframe after another. First shows what would change."
 )
@@ -41,10 +41,10 @@ class LoopsPanel:
     """The tab's content in the caller's container, and the loops in the scene.
 
     Args:
-        look_freely: stops following the sensor, so that a camera can stay where it is put.
+        look_freely: stops following the sensor, so that a camera stays where it is put.
 
     Attributes:
-        chosen: the loop that is looked at.
+        chosen: the loop that is inspected.
     """
 
     def __init__(self, page: Page, look_freely: Callable[[viser.ClientHandle], None]) -> None:
@@ -52,7 +52,7 @@ class LoopsPanel:
         self._page, self._look_freely = page, look_freely
         self.chosen: Pair | None = None
         self._coming: Pair | None = None
-        self._opener: viser.GuiHtmlHandle | None = None  # what showed this tab last, in one browser
+        self._opener: viser.GuiHtmlHandle | None = None  # HTML that last opened this tab in one browser
         self._session = -1
         self._asked: tuple[object, ...] = ()
         self._shown: frozenset[str] = frozenset(KINDS) - {"rejected"}
@@ -94,12 +94,12 @@ class LoopsPanel:
         add_command(gui, "Previous loop in the table", lambda _: self._step(-1), hotkey="K")
 
     def seen(self, view: View) -> View:
-        """The view, without the map and the scan while two submaps are shown alone."""
+        """The view; without the map and the scan while two submaps are shown alone."""
         alone = self._inspector.alone or self._add_loop.nudging
         return replace(view, map=False, scan=False, wedge=False, plane=False) if alone else view
 
     def keys(self, snapshot: Snapshot, light: bool) -> list[tuple[Rgb, str]]:
-        """Colours and names of what the scene shows of loops."""
+        """Colours and names for the legend of the loops in the scene."""
         found = {kind_of(edge).name for edge in snapshot.loops.edges}
         arches = [(kind.colour, f"{key} loop") for key, kind in KINDS.items() if key in found & self._shown]
         arches += self._proposal.ghost.key
@@ -111,7 +111,7 @@ class LoopsPanel:
         return [(OLDER, f"keyframe {chosen[0]}"), (NEWER, f"keyframe {chosen[1]}"), *arches]
 
     def choose(self, pair: Pair | None) -> None:
-        """Show everything about a loop; None: about none."""
+        """Choose a loop to inspect, or None."""
         if pair != self.chosen:
             self.chosen = pair
             self._inspector.hide_map()
@@ -171,7 +171,7 @@ class LoopsPanel:
         self._factors.content = self._bridge.live(largest_factors(loops.residuals))
 
     def _edge(self, snapshot: Snapshot) -> LoopEdge | None:
-        """The chosen loop as it is now. When it is gone, nothing is chosen."""
+        """The present state of the chosen loop. If it no longer exists, the choice is cleared."""
         chosen = self.chosen
         edge = next((edge for edge in snapshot.loops.edges if edge.pair == chosen), None)
         if edge is not None:
@@ -199,7 +199,7 @@ class LoopsPanel:
                     self.choose(None if named[text] == self.chosen else named[text])
 
     def clicked(self, event: viser.SceneClickEvent) -> bool:
-        """Take a click in the scene at an arch, or while keyframes are picked; whether it was taken."""
+        """Handle a click on an arch in the scene, or while keyframes are picked. Returns whether it did."""
         ray = self._page.in_map(event)
         if self._add_loop.picking:
             self._add_loop.pick(*ray)
@@ -245,7 +245,7 @@ class LoopsPanel:
 
 
 def stand(position: F64, look_at: F64, target: F64, distance: float) -> F64:
-    """(3,) where the camera must be to see `target` from `distance` (m), on the side it looked from before."""
+    """(3,) camera position that views `target` from `distance` (m), from the same side as before."""
     back = position - look_at
     flat = back[:2] if np.linalg.norm(back[:2]) > 1e-6 else np.array([-1.0, -1.0])
     flat = flat / np.linalg.norm(flat)

@@ -1,4 +1,4 @@
-"""All candidates in a table: what is shown of them, in which order, and the chips above that hide kinds."""
+"""The table of all candidates: its columns, its order, and the chips above it that hide kinds."""
 
 import math
 from collections.abc import Callable
@@ -16,7 +16,7 @@ MOST_ROWS: Final = 300
 @dataclass(frozen=True, slots=True)
 class TableColumn:
     """Attributes:
-    title: its name. unit: of its numbers. meaning: a sentence. key: sorts (nan goes last). text: of a cell.
+    title: its name. unit: of its numbers. meaning: a sentence. key: to sort by (NaN goes last). text: of a cell.
     """
 
     title: str
@@ -53,7 +53,7 @@ COLUMNS: Final[dict[str, TableColumn]] = {
         lambda e: e.evidence.mahalanobis, lambda e: number(e.evidence.mahalanobis, 1),
     ),
 }  # fmt: skip
-"""The first one is drawn in its kind's colour."""
+"""The first column is drawn in the colour of the loop's kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +62,12 @@ class Order:
     descending: bool = True
 
     def clicked(self, column: str) -> "Order":
-        """By that column; reversed if it was by that column already."""
+        """The order after a click: by that column, reversed if the table was sorted by it already."""
         return Order(column, not self.descending if column == self.column else column == "keyframe")
 
 
 def listed(edges: tuple[LoopEdge, ...], shown: frozenset[str], order: Order) -> list[LoopEdge]:
-    """The edges of the kinds shown in their order; those without a value last, equal ones by keyframes."""
+    """The edges of the kinds shown, sorted; edges without a value come last, and ties are sorted by keyframes."""
     key = COLUMNS[order.column].key
     sign = -1.0 if order.descending else 1.0
 
@@ -79,13 +79,13 @@ def listed(edges: tuple[LoopEdge, ...], shown: frozenset[str], order: Order) -> 
 
 
 def chips(edges: tuple[LoopEdge, ...], shown: frozenset[str]) -> str:
-    """How many there are of each kind; a click shows or hides them. Also the legend of the scene."""
+    """The number of loops of each kind; a click shows or hides a kind. Also the legend of the scene."""
     names = [kind_of(edge).name for edge in edges]
     return panel("loops.chips", [(kind, names.count(key), key in shown) for key, kind in KINDS.items() if key in names])
 
 
 def table(edges: list[LoopEdge], order: Order, chosen: Pair | None) -> str:
-    """The table of these edges; rows and column heads can be clicked."""
+    """The table of these edges; rows and column headers can be clicked."""
     arrow = "▾" if order.descending else "▴"
     signs = {key: "" if column.title else "•" for key, column in COLUMNS.items()} | {order.column: arrow}
     heads = [(key, column, signs[key]) for key, column in COLUMNS.items()]

@@ -1,4 +1,4 @@
-"""How the page distinguishes loops, and its words for them, for edits and for the graph's residuals."""
+"""The kinds of loops that the page distinguishes, and its words for loops, edits and the graph's residuals."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -35,7 +35,7 @@ class LoopKind:
 
 
 BRIDGE: Final = "loops"
-"""Name of the bridge of everything about loops that can be clicked."""
+"""Name of the bridge for everything about loops that can be clicked."""
 EDITED: Final = "edited"
 KINDS: Final[dict[str, LoopKind]] = {
     kind.name: kind
@@ -53,13 +53,13 @@ KINDS: Final[dict[str, LoopKind]] = {
         ),
     )
 }
-"""By the search's verdict, or by the fact that a person had the last word; in the order shown."""
+"""Kinds by the search's verdict, or `edited` if the user decided; in the order shown."""
 SIGNS: Final = {Verdict.ACCEPTED: "✓", Verdict.CANDIDATE: "?", Verdict.REJECTED: "✕"}
-"""Of a verdict in the table, in the order sorted."""
+"""Symbol of each verdict in the table, in sorting order."""
 
 OLDER: Final[Rgb] = (70, 170, 255)
 NEWER: Final[Rgb] = (255, 150, 60)
-"""Of the two submaps, wherever they are shown."""
+"""Colours of the two submaps, wherever they are shown."""
 
 
 def kind_of(edge: LoopEdge) -> LoopKind:
@@ -89,14 +89,14 @@ def describe_edit(command: LoopEdit) -> str:
 
 
 def what_happened(command: LoopEdit, before: F64, after: F64) -> str:
-    """A sentence on an edit that was applied, with (k, 4, 4) the poses before and after it."""
+    """A sentence on an applied edit, given the (k, 4, 4) poses before and after it."""
     verb, _, rest = describe_edit(command).partition(" ")
     past = {"add": "Added", "solve": "Solved"}.get(verb, f"{verb.capitalize()}ed")
     return panel("loops.happened", f"{past} {rest}", _moves(after, before))
 
 
 def what_was_undone(command: LoopEdit, edges: tuple[LoopEdge, ...], before: F64, after: F64) -> str:
-    """The same of an edit that was undone. edges: without it."""
+    """A sentence on an undone edit. edges: the loops without the edit."""
     verdicts = {edge.pair: edge.verdict for edge in edges}
     what = f"Undone: {describe_edit(command)}"
     if isinstance(command, Accept | Reject) and command.pair in verdicts:
@@ -105,7 +105,7 @@ def what_was_undone(command: LoopEdit, edges: tuple[LoopEdge, ...], before: F64,
 
 
 def evidence(edge: LoopEdge, params: LoopsParams) -> str:
-    """The numbers of a loop, green or red by the present limits."""
+    """The numbers of a loop, coloured green or red by the present limits."""
     e = edge.evidence
     elsewhere = "no" if np.isinf(e.alternative_m) and e.alternative_m > 0 else f"{number(e.alternative_m, 1)}"
     tiles = [
@@ -152,10 +152,10 @@ def largest_factors(residuals: tuple[FactorResidual, ...]) -> str:
 def forecast(
     command: LoopEdit, preview: Preview | None, poses: F64, residuals: tuple[FactorResidual, ...], problem: str = ""
 ) -> str:
-    """What an edit would change: how far keyframes move, and the largest residual, if it is another one then.
+    """The effect of an edit: how far keyframes move, and the largest residual if that changes.
 
     Args:
-        preview: None while the engine computes it. poses: (k, 4, 4) of the present; residuals: likewise.
+        preview: None while the engine computes it. poses: (k, 4, 4), present poses; residuals: present ones.
         problem: why the engine refuses the edit.
     """
     what = describe_edit(command).capitalize()
@@ -168,7 +168,7 @@ def forecast(
 
 
 def _moves(after: F64, before: F64) -> dict[str, Any] | None:
-    """How far keyframes would move and turn; `far` is empty when none would."""
+    """How far keyframes would move and rotate; `far` is empty if none would."""
     k = min(len(after), len(before))
     if not k:
         return None
@@ -183,7 +183,7 @@ def _moves(after: F64, before: F64) -> dict[str, Any] | None:
 
 
 def _cost_change(before: tuple[FactorResidual, ...], after: tuple[FactorResidual, ...]) -> dict[str, Any] | None:
-    """How the cost of the same factors changes; None until they are known."""
+    """The change in the cost of the same factors; None until it is known."""
     if not before:
         return None
     now, then = _cost(before), _cost(after)
