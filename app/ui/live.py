@@ -84,7 +84,7 @@ def _tiles(state: LiveState) -> Iterator[Tile]:
     shown = "–" if offset is None else f"{1e3 * offset:+,.1f}"
     yield Tile("IMU behind LiDAR", shown, "ms", "by arrival", WARN if far else "", "half")
     recorded = state.recorded
-    shown, note = ("–", "not asked for (--record)") if recorded is None else (size_text(recorded), "on disk")
+    shown, note = ("–", "off; start with --record") if recorded is None else (size_text(recorded), "on disk")
     yield Tile("recorded", shown, "", note, width="half")
     yield Tile("clock in use", _CLOCKS.get(state.clock, state.clock), width="wide")
 

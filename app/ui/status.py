@@ -1,4 +1,4 @@
-"""What is going on: the head of the page, the recording doctor's findings and the engine's notices."""
+"""The head of the page, the recording doctor's findings, and the engine's notices."""
 
 import shlex
 from typing import Final, Literal
@@ -22,11 +22,11 @@ _LEVELS: Final[dict[str, tuple[str, str, Literal["blue", "yellow", "red"], float
     "warning": ("Warning", WARN, "yellow", 12.0),
     "error": ("Error", BAD, "red", None),
 }
-"""Title, colours in the log and of the notification, and seconds until that closes. An error stays."""
+"""Title, colour in the log, colour of the notification, and seconds until it closes. An error stays open."""
 
 
 def status(snapshot: Snapshot) -> tuple[str, str]:
-    """What is going on, in a word or two, and its colour."""
+    """The status in a word or two, and its colour."""
     transport, result = snapshot.transport, snapshot.result
     if not snapshot.engine_alive:
         return "engine stopped", BAD
@@ -56,7 +56,7 @@ def title(snapshot: Snapshot) -> str:
 
 
 class HeaderPanel:
-    """Title and status. The bar says what long work is and how far it got: here the sliders would jump."""
+    """Title and status. The transport bar shows the progress of long work; if shown here, it would move the sliders."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._title = gui.add_html("")
@@ -66,20 +66,20 @@ class HeaderPanel:
 
 
 def settled(params: Params, option: str) -> Params | None:
-    """The parameters with a finding's option, as the command line would take it; None if it is no parameter."""
+    """The parameters with a finding's command-line option applied; None if the option is not a parameter."""
     try:
         words = shlex.split(option)
         if words[:1] == ["--set"] and len(words) == 2:
             return params.with_assignments(words[1:])
         if words[:1] == ["--preset"] and len(words) == 2:
             return params.merged(PRESETS[words[1]])
-    except (HemislamError, KeyError, ValueError):  # one that only a person can fill in: "[x, y, z]"
+    except (HemislamError, KeyError, ValueError):  # an option that the user must complete: "[x, y, z]"
         pass
     return None
 
 
 def findings_html(findings: tuple[Finding, ...], params: Params) -> str:
-    """The findings, those that need the user first, with a button for what would change something; the rest folded."""
+    """The findings, those that need the user first, with a button if an option would help; passed ones are folded."""
     rows: dict[str, list[tuple[Finding, str, str, str, bool]]] = {verdict: [] for verdict in reversed(_LOOKS)}
     for finding in findings:
         needed = finding.verdict == "needs you"
@@ -91,7 +91,7 @@ def findings_html(findings: tuple[Finding, ...], params: Params) -> str:
 
 
 def verdicts(findings: tuple[Finding, ...]) -> tuple[str, str] | None:
-    """All findings in a few words, and the colour of the worst."""
+    """A summary of all findings in a few words, and the colour of the worst."""
     if not findings:
         return None
     counts = {verdict: sum(finding.verdict == verdict for finding in findings) for verdict in _LOOKS}
@@ -108,7 +108,7 @@ def log_html(notices: tuple[Notice, ...]) -> str:
 
 
 class DoctorPanel:
-    """The findings of the open recording, with buttons that settle them."""
+    """The findings of the open recording, with buttons that apply their options."""
 
     def __init__(self, page: Page) -> None:
         gui = page.gui
@@ -126,7 +126,7 @@ class DoctorPanel:
         self._html.content = self._bridge.live(findings_html(findings, snapshot.params))
 
     def _settle(self, option: str) -> None:
-        """Apply a finding's option; where it is about reading the recording, read it again."""
+        """Apply a finding's option; if it affects how the recording is read, read it again."""
         snapshot = self._page.snapshot()
         known = {finding.option for finding in (snapshot.recording.findings if snapshot.recording else ())}
         after = settled(snapshot.params, option) if option in known else None
@@ -139,7 +139,7 @@ class DoctorPanel:
 
 
 class NoticePanel:
-    """The engine's notices: a notification in every browser, and a log for those that connect later."""
+    """The engine's notices: a notification in every browser, and a log for browsers that connect later."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -148,7 +148,7 @@ class NoticePanel:
         self._shown: set[int] = set()
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Notify every browser of what is new since the call before."""
+        """Notify every browser of new notices since the previous call."""
         new = [notice for notice in snapshot.notices if notice.number not in self._shown]
         if not new:
             return

@@ -1,4 +1,4 @@
-"""Study of a single frame: colours by number, the ground threshold, one point and its planes, files."""
+"""Study a single frame: colours by a number, the ground threshold, one point and its planes, downloads."""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -53,17 +53,17 @@ _ASK: Final = "Pause and click a point of the scan."
 
 
 class StudyScene:
-    """The frame in colours of its own, the point clicked, its neighbours and planes; nodes below the map's."""
+    """The frame in its own colours, the clicked point, its neighbours and planes; nodes below that of the map."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
         self._map = f"{ROOT}/study"
         self._lidar = scene.add_frame(self._map, show_axes=False)
-        self._cloud: list[viser.PointCloudHandle] = []  # one, or none
+        self._cloud: list[viser.PointCloudHandle] = []  # one node or none
         self._marks: list[Any] = []
 
     def draw_cloud(self, result: StepResult | None, by: str, size: float) -> None:
-        """The frame coloured by a number; nothing for `AS_MAP`."""
+        """Draw the frame coloured by a number; nothing for `AS_MAP`."""
         points = STUDY_MODES[by].points(result) if result is not None and by != AS_MAP else ()
         if result is None or len(points) == 0:
             clear(self._cloud)
@@ -104,7 +104,7 @@ class StudyScene:
 
 
 class StudyPanel:
-    """Widgets in the caller's container, and what they show in the scene."""
+    """Widgets in the caller's container, and the nodes that they show in the scene."""
 
     def __init__(self, page: Page) -> None:
         gui = page.gui
@@ -136,7 +136,7 @@ class StudyPanel:
         add_command(gui, "Next colour mode of the frame under study", lambda _: choose_next(self._by), hotkey="V")
 
     def seen(self, view: View) -> View:
-        """The view without what stands in the way of the study."""
+        """The view without anything that would hide the studied frame."""
         return replace(view, scan=view.scan and self._by.value == AS_MAP, map=view.map and not self._alone.value)
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
@@ -145,7 +145,7 @@ class StudyPanel:
             self._scene.draw_cloud(result, by, view.point_size)
             self._legend.content = study_legend(result, by)
         self._draw_point(snapshot, view)
-        # The page builds this plot anew for every scale, and would show none of ten a second.
+        # The page rebuilds this plot for every new scale; at ten a second, it would never show one.
         if not snapshot.transport.playing and self._curve_changes(result, snapshot.params.ground.sigma):
             self._draw_curve(result, snapshot.params.ground.sigma)
 
@@ -155,7 +155,7 @@ class StudyPanel:
         before, self._of = self._of, result
         index = self._picked.index if self._picked is not None else None
         if result is None or before is None or result.cloud.points is not before.cloud.points:
-            index = None  # that point was of another frame
+            index = None  # the point belongs to another frame
         if clicked is not None and result is not None and not snapshot.transport.playing:
             index = point_at(result, clicked)
         if not self._point_changes(result if index is not None else None, index, sigma, count, view.point_size):
@@ -182,7 +182,7 @@ class StudyPanel:
             self._summary.content = panel("curve", drawn.points_under, drawn.points_over, colours, why)
 
     def clicked(self, event: viser.SceneClickEvent) -> bool:
-        """Take any click in the scene; `draw` looks which point of the frame it means."""
+        """Take any click in the scene; `draw` finds the clicked point of the frame."""
         self._click = self._page.in_map(event)
         return True
 
@@ -197,7 +197,7 @@ class StudyPanel:
 
 
 def _scales(drawn: Curve) -> dict[str, Any]:
-    """Given explicitly: the plot finds no range itself where some numbers are nan."""
+    """The scale, given explicitly: the plot cannot find a range itself if some numbers are NaN."""
     return {"x": {"time": False}, "y": {"range": (0.0, HEADROOM * float(drawn.threshold[-1]))}}
 
 

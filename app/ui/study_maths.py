@@ -1,4 +1,4 @@
-"""The numbers of a frame under study: what colours it, the ground threshold over range, and one point of it."""
+"""Numbers of a studied frame: those that colour it, the ground threshold over range, and those of one point."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ class StudyMode:
     """One way to colour a frame.
 
     Attributes:
-        legend: the unit and what the numbers are. points: (n, 3) m, LiDAR frame, that are shown.
-        values: (n,) their numbers in the legend's unit; nan where there is none. limits: the two ends of the colours;
+        legend: the unit and what the numbers are. points: (n, 3) m, LiDAR frame, the points shown.
+        values: (n,) their numbers in the legend's unit; NaN where there is none. limits: the two ends of the colours,
             fixed where possible, so that a colour means the same in every frame.
-        open_end: numbers beyond the upper limit take its colour.
+        open_end: numbers beyond the upper limit get the colour of that limit.
     """
 
     legend: str
@@ -79,7 +79,7 @@ STUDY_BY: Final = (AS_MAP, *STUDY_MODES)
 
 
 def study_colours(result: StepResult, by: str) -> U8:
-    """(n, 3) of the points that a mode shows."""
+    """(n, 3) colours of the points that a mode shows."""
     mode = STUDY_MODES[by]
     return value_colours(mode.values(result), mode.limits(result), TABLES[mode.table])
 
@@ -96,7 +96,7 @@ def study_legend(result: StepResult | None, by: str) -> str:
 # --- the ground threshold ------------------------------------------------------------------------
 MOST_POINTS: Final = 1200
 HEADROOM: Final = 3.0
-"""Points up to this many thresholds from the plane are plotted; walls and ceilings would flatten the rest."""
+"""Points within this many thresholds of the plane are plotted; walls and ceilings would flatten the rest."""
 _LEAST_M: Final = 2.0
 
 
@@ -106,8 +106,8 @@ class Curve:
 
     Attributes:
         range: (n,) m, ascending. threshold: (n,) cm.
-        under, over: (n,) cm, |distance to the plane|; a point has one of them, the other is nan.
-        points_under, points_over: of all points, also those not shown.
+        under, over: (n,) cm, |distance to the plane|; for each point, one of them is NaN.
+        points_under, points_over: counts of all points, including those not shown.
     """
 
     range: F64
@@ -119,7 +119,7 @@ class Curve:
 
 
 def curve(result: StepResult | None, sigma: float) -> Curve:
-    """Of one frame; without points where it has no plane."""
+    """The curve of one frame; without points if it has no plane."""
     numbers = point_numbers(result.cloud.points, result) if result is not None else None
     if numbers is None or not np.isfinite(numbers.distance).all() or not len(numbers.range):
         nothing = np.full(2, np.nan)
@@ -133,7 +133,7 @@ def curve(result: StepResult | None, sigma: float) -> Curve:
     count = min(len(shown), MOST_POINTS)
     shown = shown[np.arange(count) * len(shown) // max(count, 1)]
     cm = 100 * distance[shown]
-    # The two ends belong to the threshold's line alone.
+    # The first and last entries belong only to the line of the threshold.
     return Curve(
         range=np.concatenate(([0.0], numbers.range[shown], [farthest])),
         under=np.concatenate(([np.nan], np.where(under[shown], cm, np.nan), [np.nan])),
@@ -147,11 +147,11 @@ def curve(result: StepResult | None, sigma: float) -> Curve:
 # --- one point -----------------------------------------------------------------------------------
 _CLOSE: Final = np.radians(0.4)
 _REACH: Final = np.radians(1.0)
-"""A click means the nearest point within `_CLOSE` of its ray, else the one closest to the ray within `_REACH`."""
+"""A click selects the nearest point within `_CLOSE` of its ray, else the one closest to the ray within `_REACH`."""
 
 
 def nearest_to_ray(points: F32, origin: F64, direction: F64) -> int | None:
-    """Index of the point of (n, 3) that a click means, or None. The ray is in the points' frame."""
+    """Index of the clicked point of (n, 3) points, or None. The ray is in the points' frame."""
     if len(points) == 0:
         return None
     towards = points.astype(np.float64) - origin
@@ -167,17 +167,18 @@ def nearest_to_ray(points: F32, origin: F64, direction: F64) -> int | None:
 
 
 def point_at(result: StepResult, ray: tuple[F64, F64]) -> int | None:
-    """The same of a frame's points. ray: origin and direction, (3,) each, in the map."""
+    """Index of the clicked point of a frame, or None. ray: origin and direction, (3,) each, in the map."""
     T = lie.inverse(result.T_map_lidar)
     return nearest_to_ray(result.cloud.points, lie.moved(T, ray[0]), T[:3, :3] @ ray[1])
 
 
 @dataclass(frozen=True, slots=True)
 class Picked:
-    """A point under study. Lengths m, angles rad; `patch` in the LiDAR frame.
+    """A studied point. Lengths in m, angles in rad; `patch` in the LiDAR frame.
 
     Attributes:
-        match: which of the result's matches is the nearest point that the filter used, -1 without one. away: to it.
+        match: index in the result's matches of the nearest point that the filter used; -1 without one. away: distance
+            to it.
     """
 
     index: int
@@ -194,7 +195,7 @@ def pick(result: StepResult, index: int, sigma: float, neighbours: int) -> Picke
     """Everything about one point of the result's cloud.
 
     Args:
-        sigma: of the ground threshold, m per m of range. neighbours: how many points its patch has.
+        sigma: of the ground threshold, m per m of range. neighbours: number of points in the patch.
     """
     point = result.cloud.points[index : index + 1]
     numbers = point_numbers(point, result)

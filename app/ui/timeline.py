@@ -1,4 +1,4 @@
-"""Diagnostics: strips of what was measured at every frame of the recording, unfolded above the transport.
+"""Diagnostics: strips of measurements at every frame of the recording, shown above the transport.
 
 Frames are thinned to columns in which spikes stay visible.
 """
@@ -21,9 +21,9 @@ from app.ui.widgets import Changes, Page, add_command
 
 _PERIOD_S: Final = 0.5
 COLUMNS: Final = 480
-"""Most columns that a recording is thinned to, however long."""
+"""Any recording is thinned to at most this many columns."""
 OPEN_CM, OPEN = 1e3, "> 10 m"
-"""A direction that is more uncertain than this is open: how uncertain says nothing more."""
+"""A direction more uncertain than this counts as unconstrained; the exact value would mean nothing."""
 DEGENERATE_CM: Final = 10.0
 """A direction more uncertain than this is called degenerate (`app.slam.iekf.DEGENERATE_SIGMA`)."""
 _NOTES: Final = 50
@@ -37,10 +37,10 @@ class Strip:
     """One row of the timeline.
 
     Attributes:
-        name, unit, hint: for people. digits: after the point. colour: CSS.
-        least: the scale ends here at least. value: (n,) in the strip's unit, nan where there is none.
-        limit: from where on a value is bad. worse: which way is bad. bars: single events, not a curve.
-        most: from where on words stand for a value, and which.
+        name, unit, hint: shown to the user. digits: decimal places. colour: CSS.
+        least: the upper end of the scale is at least this. value: (n,) in the strip's unit, NaN where there is none.
+        limit: beyond it, a value is bad. worse: the bad direction. bars: draw single events instead of a curve.
+        most: a value, and the words that replace numbers from this value on.
     """
 
     key: str
@@ -62,7 +62,7 @@ def _inliers(series: Series) -> F64:
 
 
 def uncertainty_cm(degeneracy: F64) -> F64:
-    """Of the direction that a scan constrains least, 1 σ; at most `OPEN_CM`."""
+    """1 σ of the direction that a scan constrains least; at most `OPEN_CM`."""
     with np.errstate(divide="ignore"):
         return np.minimum(100 / np.sqrt(np.maximum(degeneracy, 0.0)), OPEN_CM)
 
@@ -91,7 +91,7 @@ STRIPS: Final = (
     Strip("error", "error", "cm", 1, "#ff5c8d", 5.0, "Distance to the truth, aligned to the trajectory so far.",
           lambda s: 1e2 * s["error_m"]),
 )  # fmt: skip
-"""In the order shown; the loops' row comes last."""
+"""In the order shown; the row of loops comes last."""
 
 _STAMP: Final = "stamp"
 _VALUES: Final[dict[str, Callable[[Series], F64]]] = {
@@ -101,15 +101,15 @@ _VALUES: Final[dict[str, Callable[[Series], F64]]] = {
 
 
 def limits(snapshot: Snapshot) -> dict[str, float]:
-    """From where on a strip's value is bad, by key: above it, or below it where low is worse."""
+    """Limits by the strips' keys: a value above its limit is bad, or below it if low values are worse."""
     return {strip.key: strip.limit(snapshot) for strip in STRIPS if strip.limit is not None}
 
 
 class History:
-    """Every frame seen in a session. Frames that were gone back over stay until they are processed again.
+    """Every frame seen in a session. After going back, later frames stay until they are processed again.
 
     Attributes:
-        total: frames of the recording. present: the newest frame of the snapshot seen last, or -1.
+        total: frames in the recording. present: the newest frame of the last snapshot, or -1.
     """
 
     def __init__(self) -> None:
@@ -117,11 +117,11 @@ class History:
         self.present = -1
         self._session = -1
         self._truth: Path | None = None
-        self._columns: dict[str, F64] = {}  # (total,) by strip and for stamps, nan where unknown
-        self._loops: dict[Pair, tuple[int, Verdict]] = {}  # when each candidate got which verdict
+        self._columns: dict[str, F64] = {}  # (total,) per strip and for stamps, NaN where unknown
+        self._loops: dict[Pair, tuple[int, Verdict]] = {}  # frame and verdict of each candidate
 
     def see(self, snapshot: Snapshot) -> None:
-        """Take in what a snapshot says of all frames up to its newest."""
+        """Store a snapshot's values of all frames up to its newest."""
         recording, series = snapshot.recording, snapshot.series
         if snapshot.session != self._session:
             self._session, self._columns, self._loops = snapshot.session, {}, {}
@@ -135,15 +135,15 @@ class History:
                 column[:count] = value(series)[:count]
             self._columns[key] = column
         if truth != self._truth:
-            self._columns["error"][count:] = np.nan  # they are distances to another truth
+            self._columns["error"][count:] = np.nan  # these are distances to another truth
         later = {pair: entry for pair, entry in self._loops.items() if entry[0] >= count}
         edges, chunks = snapshot.loops.edges, snapshot.chunks
-        here = [edge for edge in edges if edge.decided_at < len(chunks)]  # others are of keyframes that come later
+        here = [edge for edge in edges if edge.decided_at < len(chunks)]  # the others concern later keyframes
         self._loops = later | {edge.pair: (chunks[edge.decided_at].frame, edge.verdict) for edge in here}
         self._truth, self.present = truth, count - 1
 
     def columns(self) -> "Columns":
-        """Everything, thinned to columns of equally many frames."""
+        """All frames, thinned to columns with equal numbers of frames."""
         count = min(self.total, COLUMNS)
         starts = np.arange(count) * self.total // count
         loops: dict[str, list[int]] = {verdict: [0] * count for verdict in Verdict}
@@ -154,7 +154,7 @@ class History:
         return Columns(starts=starts, stamps=self._columns[_STAMP][starts], low=low, high=high, loops=loops)
 
     def troubles(self, limits: dict[str, float]) -> list[int]:
-        """First frame of each stretch in which a value, but for the frame time, is bad: the red triangles."""
+        """First frame of each stretch in which any value except the frame time is bad: the red triangles."""
         bad = np.zeros(self.total, bool)
         for strip in STRIPS:
             limit = limits.get(strip.key)
@@ -168,8 +168,8 @@ class History:
 class Columns:
     """Attributes:
     starts: (c,) first frame of each column. stamps: (c,) s since the recording's start.
-    low, high: (c,) least and greatest value of a column by `Strip.key`, nan where there is none.
-    loops: how many of each verdict.
+    low, high: (c,) least and greatest value in a column by `Strip.key`, NaN where there is none.
+    loops: number of loops in each column, by verdict.
     """
 
     starts: I64
@@ -180,7 +180,7 @@ class Columns:
 
 
 def message(history: History, snapshot: Snapshot) -> dict[str, Any]:
-    """What the page's script draws (`templates/transport.js`), as JSON-ready values."""
+    """Values for the page's script (`templates/transport.js`) to draw, ready for JSON."""
     columns, bad = history.columns(), limits(snapshot)
     recording = snapshot.recording
     strips = []
@@ -218,7 +218,7 @@ def packed(numbers: F64) -> str:
 
 
 class TimelinePanel:
-    """The strips' numbers, which `templates/transport.js` draws above the transport and marks on its track."""
+    """The numbers of the strips; `templates/transport.js` draws them above the transport and marks its track."""
 
     def __init__(self, page: Page) -> None:
         gui = page.gui
@@ -231,7 +231,7 @@ class TimelinePanel:
         add_command(gui, "Go to the previous problem", lambda _: self._jump(-1), hotkey="B")
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Called often; sends what changed, at most twice a second."""
+        """Send changes, at most twice a second. Called often."""
         if snapshot.transport.frame < self._latest.transport.frame:
             self._history.see(self._latest)  # the last frames before going back
         self._latest = snapshot

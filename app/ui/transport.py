@@ -1,4 +1,4 @@
-"""The bar at the scene's lower edge: play, step, speed and time, the same by keyboard; where playing pauses."""
+"""The bar at the scene's lower edge: play, step, speed and time; the same by keyboard; and the breakpoints."""
 
 import json
 import math
@@ -36,12 +36,12 @@ SPEEDS: Final = {
 
 
 class TransportPanel:
-    """The bar, a piece of HTML that `templates/transport.js` moves to the scene's lower edge.
+    """The bar: HTML that `templates/transport.js` moves to the scene's lower edge.
 
     The strips of `app.ui.timeline` unfold above it.
 
-    choose_ends: called with the ends that the user gave the colour bar, in percent of all values.
-    cover: called with a browser and how many pixels of its scene the bar and the strips hide.
+    choose_ends: called with the ends of the colour bar chosen by the user, in percent of all values.
+    cover: called with a browser and the number of pixels of its scene that the bar and the strips hide.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class TransportPanel:
             self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
     def _asked(self, word: str, client: viser.ClientHandle) -> None:
-        """What the page's script sends: "play", "pause", "step -1", "seek 812", "speed 2×", "ends 0 80", "cover 66"."""
+        """Handle what the script sends: "play", "pause", "step -1", "seek 812", "speed 2×", "ends 0 80", "cover 66"."""
         match word.split(" ", 1):
             case ["play"]:
                 self.toggle()
@@ -99,7 +99,7 @@ class TransportPanel:
 
 
 def state(snapshot: Snapshot) -> dict[str, Any]:
-    """What the bar shows, as JSON-ready values. A live source has no past and its own pace."""
+    """Values for the bar, ready for JSON. A live source cannot go back and has its own pace."""
     recording, transport = snapshot.recording, snapshot.transport
     return {
         "open": recording is not None,
@@ -122,7 +122,7 @@ def speed_name(factor: float) -> str:
 
 
 def where(snapshot: Snapshot) -> str:
-    """Frame, seconds into the recording, and the stamp in UTC; of a live source, why there is no way back."""
+    """Frame, seconds into the recording, and the stamp in UTC; for a live source, why it cannot go back."""
     recording, transport = snapshot.recording, snapshot.transport
     if snapshot.progress is not None:
         return panel("quiet", working(snapshot.progress))
@@ -153,13 +153,13 @@ def where(snapshot: Snapshot) -> str:
 
 
 def done(progress: Progress | None) -> float:
-    """The share that is done of long work; 0 while that is unknown, or without such work."""
+    """The share of long work that is done; 0 while that is unknown, or without such work."""
     share = progress.fraction if progress is not None else 0.0
     return min(max(share, 0.0), 1.0) if math.isfinite(share) else 0.0
 
 
 def working(progress: Progress) -> str:
-    """What takes long, and how far it is."""
+    """The title of long work, and its progress."""
     return progress.title + (f" · {100 * done(progress):.0f} %" if math.isfinite(progress.fraction) else " …")
 
 
@@ -169,14 +169,14 @@ def _utc(stamp_ns: int) -> str:
 
 
 class BreakpointPanel:
-    """Where playing is to pause: a switch for each condition, and a limit where there is one."""
+    """The breakpoints: a checkbox for each condition, and its limit if it has one."""
 
     def __init__(self, page: Page) -> None:
         gui = page.gui
         self._send = page.send
         self._shown = Breakpoints()
         self._switches: dict[str, viser.GuiCheckboxHandle] = {}
-        self._numbers: dict[str, viser.GuiNumberHandle[float]] = {}  # of those that have a limit
+        self._numbers: dict[str, viser.GuiNumberHandle[float]] = {}  # of conditions with a limit
         for one in BREAKPOINTS:
             self._switches[one.name] = gui.add_checkbox(one.title, False, hint=one.hint)
             if (limit := one.limit) is not None:
@@ -189,7 +189,7 @@ class BreakpointPanel:
 
     def draw(self, snapshot: Snapshot) -> None:
         now = snapshot.breakpoints
-        if now == self._shown:  # a control just set stays until the engine has heard of it
+        if now == self._shown:  # a control just set stays until the engine confirms it
             return
         self._shown = now
         for one in BREAKPOINTS:

@@ -1,4 +1,4 @@
-"""Tune: a search for better parameters on the open recording, in a process of its own; a click opens a trial as B."""
+"""Search for better parameters on the open recording, in a process of its own; a click opens a trial as B."""
 
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -21,12 +21,12 @@ from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_button
 
 _PARTS: Final = {"5 s from here": 5.0, "20 s from here": 20.0, "60 s from here": 60.0, "the whole recording": None}
 _LEAST_S: Final = 5.0
-"""Of less, a search shows nothing."""
+"""A search on a shorter part would show nothing."""
 _LABELLED: Final = "the labelled frames"
 _NONE: Final = "–"
 _TITLES: Final = {one.title: one.name for one in OBJECTIVES.values()}
 _FORK: Final = "trial "
-"""How forks that were opened here are named."""
+"""Names of forks opened here."""
 _EMPTY: Final = (
     "Choose the parameters to vary and the objective, go to a part of the recording that shows the problem, and press "
     "Start. Each trial processes that part with other parameters, without changing this session."
@@ -34,18 +34,18 @@ _EMPTY: Final = (
 
 
 class TunePanel:
-    """What is asked for, the progress, and plots of the trials.
+    """The settings of the search, its progress, and plots of the trials.
 
     Args:
-        folder: for the files that a search leaves. sides: shows the parameters of the trial that is opened.
+        folder: for the files that a search writes. sides: shows the parameters of the opened trial.
     """
 
     def __init__(self, page: Page, forks: Workspace, sides: Sides, folder: Path) -> None:
         gui = page.gui
         self._page, self._forks, self._sides, self._folder = page, forks, sides, folder
-        self._wanted: Wanted | None = None  # by the search that was started last
+        self._wanted: Wanted | None = None  # by the newest search
         self._found, self._chosen = Tried(), -1
-        self._runs: list[tuple[float, int]] = []  # when how many runs had ended, since the last that took no time
+        self._runs: list[tuple[float, int]] = []  # (time, finished runs), since the last run that took no time
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._why = gui.add_html("")
         self._parameters = gui.add_text(
@@ -93,7 +93,7 @@ class TunePanel:
                 self._work.show(min(done / (self._wanted.trials + 1), 1.0))
 
     def close(self) -> None:
-        """End what is under way; its finished runs stay."""
+        """Stop a search in progress; its finished runs stay."""
         self._work.stop()
 
     @staticmethod
@@ -117,7 +117,7 @@ class TunePanel:
         )
 
     def _left(self, wanted: Wanted) -> str:
-        """By the pace of the newest runs."""
+        """The time left, estimated from the pace of the newest runs."""
         if len(self._runs) < 2:
             return "the remaining time is not known yet"
         (begin, first), (end, last) = self._runs[-9:][0], self._runs[-1]
@@ -169,12 +169,12 @@ class TunePanel:
         self._run()
 
     def _chosen_part(self, snapshot: Snapshot, stamps: list[int]) -> tuple[float, float | None]:
-        """Its start and length, s. stamps: of labelled frames, ascending."""
+        """Start and length of the chosen part, s. stamps: of labelled frames, ascending."""
         assert snapshot.recording is not None
         start_ns = snapshot.recording.start_ns
         if self._part.value == _LABELLED:
             first, last = ((stamp - start_ns) * 1e-9 for stamp in (stamps[0], stamps[-1]))
-            begin = round(max(first - 0.15, 0.0), 1)  # a scan before its end
+            begin = round(max(first - 0.15, 0.0), 1)  # before the scan that ends there
             return begin, round(last - begin + 0.2, 1)
         length, here = _PARTS[self._part.value], snapshot.transport.stamp_ns or start_ns
         if length is None:
@@ -188,13 +188,13 @@ class TunePanel:
         return begin, length
 
     def _run(self) -> None:
-        """Begin, or go on: a search finds the runs that were finished before."""
+        """Begin or continue: a search reuses runs that finished before."""
         if self._wanted is not None and not self._work.running:
             self._found, self._runs, self._chosen = Tried(), [], -1
             self._work.begin(find, self._wanted)
 
     def _clicked(self, word: str, _: viser.ClientHandle) -> None:
-        """What the plots send: "trial 12". Opens it beside the present parameters; B's are then on the sliders."""
+        """Handle what the plots send: "trial 12". Open it as B beside the present parameters; the sliders show B's."""
         number = int(word.removeprefix("trial "))
         if not 0 <= number < len(self._found.trials):
             return

@@ -1,4 +1,4 @@
-"""Where trials lie in the plots of the Tune tab, and what is said of them: pure functions."""
+"""The plots and texts of the Tune tab: pure functions."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,19 +14,19 @@ from app.ui.colours import TABLES
 from app.ui.html import panel
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, 334.0, 8.0, 108.0
-"""Of a scatter plot, in units of its picture."""
+"""Edges of a scatter plot, in units of its picture."""
 _AXES: Final = (24.0, 316.0, 16.0, 120.0)
 """Left, right, top and bottom of the parallel coordinates."""
 _OUTLIERS: Final = 5.0
-"""Per cent of trials whose bad scores may lie on the edge of a plot."""
+"""Percent of trials whose bad scores may be clipped to the edge of a plot."""
 _WIDE: Final = 50.0
-"""A range is drawn by ratios where its ends differ by more than this factor."""
+"""An axis is logarithmic if its ends differ by more than this factor."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
     """Attributes:
-    low, high: values at its two ends. share: of a value, 0-1 along the axis.
+    low, high: values at its two ends. share: position of a value along the axis, 0-1.
     """
 
     name: str
@@ -45,13 +45,13 @@ class Dot(NamedTuple):
 
 
 def words(trial: Trial, objectives: Sequence[Objective]) -> str:
-    """A trial in a line, as the page shows it on hover."""
+    """A trial in one line, as the page shows it on hover."""
     scores = ", ".join(f"{one.title} {one.text(value)}" for one, value in zip(objectives, trial.scores, strict=True))
     return f"trial {trial.number}: {scores} · {trial.name}"
 
 
 def number_axis(name: str, values: Sequence[float]) -> Axis:
-    """An axis over these numbers, by ratios where they span much."""
+    """An axis over these numbers, logarithmic if their range is wide."""
     low, high = min(values), max(values)
     by = math.log if low > 0 and high > _WIDE * low else float
     begin, span = by(low), by(high) - by(low)
@@ -59,7 +59,7 @@ def number_axis(name: str, values: Sequence[float]) -> Axis:
     def share(value: float) -> float:
         return (by(min(max(value, low), high)) - begin) / span if span else 0.5
 
-    # enough digits to tell the two ends apart by three
+    # enough digits that the difference of the two ends has three
     digits = max(4, 3 + math.ceil(math.log10(max(abs(low), abs(high)) / (high - low)))) if span else 4
     return Axis(name, f"{low:.{digits}g}", f"{high:.{digits}g}", share)
 
@@ -90,7 +90,7 @@ def _parameter_axis(path: str, trials: Sequence[Trial]) -> Axis:
 def dots(
     found: Tried, objectives: Sequence[Objective], x: tuple[Axis, Callable[[Trial], float]], y: int, chosen: int
 ) -> tuple[list[Dot], Axis]:
-    """Trials that have scores, in a scatter plot over `x`, and the axis of objective `y`."""
+    """Dots of the trials with scores, in a scatter plot over `x`, and the axis of objective `y`."""
     done = [trial for trial in found.trials if trial.complete]
     axis, (across, value) = score_axis(done, y, objectives[y]), x
     return [
@@ -107,14 +107,14 @@ def dots(
 
 
 def best_so_far(drawn: Sequence[Dot], greatest: bool) -> str:
-    """The line of the best score until each trial."""
+    """The line of the best score up to each trial."""
     heights = np.array([dot.y for dot in drawn])  # downwards
     best = np.minimum.accumulate(heights) if greatest else np.maximum.accumulate(heights)
     return " ".join(f"{dot.x:g},{height:g}" for dot, height in zip(drawn, best, strict=True))
 
 
 def parallel(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
-    """Each trial as a line through its parameters and scores; the better by the first objective, the lighter."""
+    """Each trial as a line through its parameters and scores; the lighter, the better by the first objective."""
     done = [trial for trial in found.trials if trial.complete and trial.values]
     if len(done) < 2:
         return ""
@@ -138,7 +138,7 @@ def parallel(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
 
 
 def plots(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
-    """All that is known of the trials, as HTML; "" before the first score."""
+    """All results of the trials as HTML; "" before the first score."""
     done = [trial for trial in found.trials if trial.complete]
     if not done:
         return ""
@@ -178,7 +178,7 @@ def _best(found: Tried, objectives: Sequence[Objective], chosen: int) -> str:
 
 
 def left(seconds: float) -> str:
-    """A time to go, in words."""
+    """A remaining time in words."""
     if seconds < 90:
         return f"{max(round(seconds), 1)} s left"
     return f"{round(seconds / 60)} min left" if seconds < 5400 else f"{seconds / 3600:.1f} h left"

@@ -1,10 +1,10 @@
-"""Everything that relies on how viser's page is built, in one place; `tests/ui/test_viser_contract.py` checks it.
+"""Everything that relies on the structure of viser's page; `tests/ui/test_viser_contract.py` checks it.
 
-viser has no events for HTML, no way to run a script, and keys of its own. So this module assumes:
+viser has no events for HTML and no way to run a script, and it has keys of its own. So this module assumes:
 
 * HTML elements are inserted as they are, and an `<img onload=...>` in them runs.
-* The elements of a container are siblings in the order in which they were added: a text field that is followed by
-  HTML is that HTML's previous sibling.
+* The elements of a container are siblings, in the order in which they were added: a text field directly before some
+  HTML is the previous sibling of that HTML.
 * A text field is an `<input>` whose `input` events viser sends.
 * Hotkeys are listened to on the html element, the camera's keys on the document.
 * A button has the class `mantine-Button-root`, and `gray-filled` in its style if it is gray; a text field has the class
@@ -34,13 +34,13 @@ def prepare_page(gui: viser.GuiApi) -> None:
 
 
 class Bridge:
-    """Clicks on the page's own HTML that reach the server.
+    """Sends clicks on the page's own HTML to the server.
 
-    An element that names a word in `data-hs` writes it into a hidden text field, whose changes viser sends.
+    A clicked element writes the word in its `data-hs` into a hidden text field, whose changes viser sends.
 
     Args:
-        name: unlike that of any other bridge. act: called with the word of what was clicked, or chosen with Enter,
-            and the browser.
+        name: unique among all bridges. act: called with the word of the element that was clicked, or chosen with
+            Enter, and the browser.
     """
 
     def __init__(self, gui: viser.GuiApi, name: str, act: Callable[[str, viser.ClientHandle], None]) -> None:

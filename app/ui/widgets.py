@@ -1,4 +1,4 @@
-"""What every panel needs: the page it is on, and helpers for viser's widgets."""
+"""Shared by all panels: the page, the view, and helpers for viser's widgets."""
 
 import asyncio
 import time
@@ -22,27 +22,27 @@ from app.ui.map_numbers import MapNumbers
 
 SCENE_PERIOD_S: Final = 1 / 15
 PANEL_PERIOD_S: Final = 1 / 4
-"""The scene and the panels are drawn at most this often."""
+"""Least periods between two drawings of the scene and of the panels."""
 ROOT: Final = "/map"
-"""Scene node of the map. It is moved while the sensor is followed; everything in the map's frame hangs below it."""
+"""Scene node of the map: the parent of everything in the map's frame. It moves while the sensor is followed."""
 
 
 _STANDING_BACK: Final = 0.35
-"""Size of the map's points while parameters are tuned, as a share of the usual."""
+"""Size of the map's points while parameters are tuned, as a share of the usual size."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """How the session is looked at: shared by every browser, unknown to the engine.
+    """How the session is displayed: the same in every browser, unknown to the engine.
 
     Attributes:
         colour_by: a name of `app.ui.colours.COLOUR_BY`. point_size: m. follow: keep the sensor in the middle.
-        ceilings, moving: show points above the ceiling too, and those on what moves.
+        ceilings, moving: show ceilings, and points on moving objects.
         map, scan, wedge, plane, path, grid, notes: whether shown.
         light: a light background. tuning: the map is dimmed behind the present scan, which shows its labels.
-        ends: of the colour map, where the user chose them. clip: outside which points are hidden.
-        slab: m, how wide the profile along the walk is that is shown instead of the map; 0: none is.
-        numbers: those of the points that `colour_by` shows, where they depend on the whole map.
+        ends: of the colour map, if the user chose them. clip: points outside this box are hidden.
+        slab: m, width of the profile along the walk that is shown instead of the map; 0: no profile.
+        numbers: the points' numbers that `colour_by` shows, if these depend on the whole map.
     """
 
     colour_by: str = LOOK
@@ -71,11 +71,11 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """The page that a panel is part of.
+    """The page to which a panel belongs.
 
     Attributes:
         send: enqueues a command for the engine. snapshot: the newest one. now: monotonic seconds.
-        offset: (3,) m, where the map's origin is in the scene.
+        offset: (3,) m, position of the map's origin in the scene.
     """
 
     server: viser.ViserServer
@@ -97,9 +97,9 @@ class Page:
         return np.array(event.ray_origin) - self.offset(), np.array(event.ray_direction)
 
     def in_picture(self, client: viser.ClientHandle, points: F64) -> F64:
-        """Where (n, 3) points of the map are in a browser's picture, (n, 2), 0-1 from its top left.
+        """(n, 2) positions of (n, 3) points of the map in a browser's picture, 0-1 from its top left.
 
-        Points behind the camera are nowhere: nan.
+        NaN for points behind the camera.
         """
         camera = client.camera
         w, x, y, z = (float(value) for value in camera.wxyz)
@@ -115,15 +115,16 @@ class Page:
 
 Callback = Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]
 _THREADS: Final = ThreadPoolExecutor(32, "page")
-"""Do what was asked for; viser has as many. Some wait for minutes, for a picture."""
+"""Threads that run callbacks, as many as viser has. Some wait minutes for a picture."""
 _NumberBox = TypeVar("_NumberBox", bound=viser.GuiNumberHandle[Any] | viser.GuiVector3Handle)
 _PLAIN: Final = (str, int, float, Enum, frozenset, View, Limits)
 
 
 class Changes:
-    """Whether something is to be drawn again: what it depends on differs from the last time, and a period has passed.
+    """Decides whether to draw again: if the inputs differ from the last time, and a period has passed.
 
-    Parts of a snapshot that did not change are the same objects in the next one. Words and numbers are compared.
+    Inputs are compared by identity, since unchanged parts of a snapshot are the same objects in the next one; texts and
+    numbers are compared by value.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic, period_s: float = 0.0) -> None:
@@ -132,7 +133,7 @@ class Changes:
         self._at = -1e9
 
     def __call__(self, *parts: object, at_once: bool = False) -> bool:
-        """True where `parts` are to be drawn now. at_once: without waiting for the period."""
+        """Whether to draw `parts` now. at_once: do not wait for the period."""
         now, drawn = self._now(), self._drawn
         if not at_once and now - self._at < self._period:
             return False
@@ -144,7 +145,7 @@ class Changes:
 
 @dataclass(slots=True)
 class Edit:
-    """A value that a user set, when, and whether it was sent to the engine. Older snapshots must not undo it."""
+    """A value that a user set, its time, and whether it was sent to the engine. Older snapshots must not undo it."""
 
     value: Any
     at: float
@@ -156,7 +157,7 @@ def _same(before: object, now: object) -> bool:
 
 
 def show(control: Any, value: Any) -> None:
-    """Make a control show `value`. Where that is new, its callbacks run with `client=None`; `by_user` ignores those.
+    """Make a control show `value`. If that is new, its callbacks run with `client=None`; `by_user` ignores those.
 
     mypy overlooks viser's setter.
     """
@@ -164,9 +165,9 @@ def show(control: Any, value: Any) -> None:
 
 
 def limited(box: _NumberBox) -> _NumberBox:
-    """A number box that keeps to its limits: what is typed beyond them becomes the nearest that is allowed.
+    """A number box that enforces its limits: a typed value beyond a limit becomes the limit.
 
-    viser applies them to its arrows alone. Its event loop waits for this callback and only then calls later ones.
+    viser applies the limits only to the arrows. Its event loop waits for this callback before it calls later ones.
     """
     low, high = (-np.inf if box.min is None else box.min), (np.inf if box.max is None else box.max)
 
@@ -178,14 +179,14 @@ def limited(box: _NumberBox) -> _NumberBox:
 
 
 def choose_next(dropdown: viser.GuiDropdownHandle[str]) -> None:
-    """Choose the option after the present one; the first after the last."""
+    """Choose the next option; after the last one, the first."""
     options = dropdown.options
     show(dropdown, options[(options.index(dropdown.value) + 1) % len(options)])
 
 
 @contextmanager
 def dialog(client: viser.ClientHandle, title: str) -> Iterator[Callable[[], None]]:
-    """A dialog in one browser, to be filled by the caller, with a Cancel button at its end; yields what closes it."""
+    """A dialog in one browser, filled by the caller, with a Cancel button at the end; yields a function to close it."""
     with client.gui.add_modal(title) as modal:
         yield modal.close
         cancel = client.gui.add_button("Cancel", color="gray")
@@ -195,10 +196,10 @@ def dialog(client: viser.ClientHandle, title: str) -> Iterator[Callable[[], None
 def ask_text(
     client: viser.ClientHandle, title: str, label: str, text: str, confirm: str, act: Callable[[str], None]
 ) -> None:
-    """A dialog in one browser with a text to edit. A HemislamError of `act` is shown, and the dialog stays.
+    """A dialog in one browser with a text to edit. If `act` raises HemislamError, it is shown and the dialog stays.
 
     Args:
-        label: of the field. text: in it at first. confirm: on the button that calls `act` with what it holds then.
+        label: of the field. text: its initial content. confirm: label of the button that calls `act` with the text.
     """
     with dialog(client, title) as close:
         field = client.gui.add_text(label, text)
@@ -217,13 +218,13 @@ def notify_error(client: viser.ClientHandle, error: object) -> None:
 
 
 def by_user(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
-    """Calls `act` in a thread with the new value and the browser, and only when a person changed it.
+    """Calls `act` in a thread with the new value and the browser, but only if a user changed the value.
 
-    What it raises as HemislamError or OSError is shown in that browser. viser also calls back when code sets a value.
-    Sending those on would make the page and the engine answer each other for ever.
+    A HemislamError or OSError from `act` is shown in that browser. viser also calls back when code sets a value; if
+    those calls were passed on, the page and the engine would answer each other for ever.
 
-    viser calls a coroutine the moment it receives the value, but a plain function later, from a thread. By then another
-    value may be in the control, and would be taken for the one that was set.
+    viser calls a coroutine as soon as it receives the value, but a plain function later, from a thread. By then the
+    control may hold another value, which would be mistaken for the one that was set.
     """
 
     def tried(value: Any, client: viser.ClientHandle) -> None:
@@ -251,7 +252,7 @@ def add_button(
 ) -> viser.GuiButtonHandle:
     """A button that calls `act` with the browser in which it is clicked; see `by_user`.
 
-    It is gray unless `color` says otherwise; None is the theme's colour.
+    It is gray by default; `color=None` is the theme's colour.
     """
     button = gui.add_button(text, icon=icon, **({"color": "gray"} | options))
     button.on_click(by_user(lambda _, client: act(client)))
@@ -259,9 +260,9 @@ def add_button(
 
 
 def add_command(gui: viser.GuiApi, text: str, act: Callable[[viser.ClientHandle], None], **key: Any) -> None:
-    """A command in the page's list, also by its key; `act` is called with the browser that gave it.
+    """A command in the page's list, and its key; `act` is called with the browser that used it.
 
-    A HemislamError that it raises, because there is nothing to be done, is shown there for a while.
+    A HemislamError from `act`, which means that there is nothing to do, is shown there for a while.
     """
 
     def given(event: viser.CommandEvent) -> None:
@@ -275,9 +276,9 @@ def add_command(gui: viser.GuiApi, text: str, act: Callable[[viser.ClientHandle]
 
 
 def as_set(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
-    """As `by_user`, but before anything else happens: for controls that code sets too, and where `act` reads others.
+    """As `by_user`, but at once, in viser's event loop: for controls that code also sets, or if `act` reads others.
 
-    It must only note or enqueue, since viser's event loop waits for it.
+    `act` must only store or enqueue something, since viser's event loop waits for it.
     """
 
     async def callback(event: viser.GuiEvent[Any]) -> None:
@@ -290,7 +291,7 @@ def as_set(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
 def chart(
     gui: viser.GuiApi, data: tuple[F64, ...], lines: list[dict[str, Any]], height: int = 110, **options: Any
 ) -> viser.GuiUplotHandle:
-    """A small chart over `data[0]`. lines: uPlot's series, without the first one."""
+    """A small chart over `data[0]`. lines: uPlot's series except the first one."""
     axes: Any = tuple({"font": "10px sans-serif", "ticks": {"size": 3}, "gap": 2, "size": size} for size in (22, 38))
     settings: dict[str, Any] = {"scales": {"x": {"time": False}}, "cursor": {"show": False}} | options
     series: Any = ({"label": "x"}, *({"points": {"show": False}} | line for line in lines))

@@ -1,9 +1,9 @@
-"""The page of a session: puts the panels together and draws snapshots into them.
+"""The page of a session: assembles the panels and draws snapshots into them.
 
-Callbacks of the page only enqueue commands for the engine. One thread draws: it waits for snapshots
-and sends what differs between the last one drawn and the newest. Everything is drawn on the server's
-scene and panels, which viser keeps for every browser, also those that connect or reload later. Every
-panel has a `draw` that this thread calls often; a panel sends only what differs from what it shows.
+Callbacks of the page only enqueue commands for the engine. One thread draws: it waits for snapshots and sends the
+differences between the last drawn snapshot and the newest. Everything is drawn on the server's scene and panels, which
+viser keeps for every browser, including those that connect or reload later. Every panel has a `draw` that this thread
+calls often; a panel sends only changes.
 """
 
 import logging
@@ -53,19 +53,19 @@ from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 log = logging.getLogger(__name__)
 
 _TUNING_S: Final = 8.0
-"""After a change of a ground parameter the map is dimmed behind the present scan for at least this long."""
+"""After a change of a ground parameter, the map is dimmed behind the present scan for at least this long."""
 _TICK_S: Final = 0.04
-"""How long the drawing thread waits for a snapshot before it looks at the page's own controls."""
+"""How long the drawing thread waits for a snapshot before it checks the page's own controls."""
 
 
 class Workbench:
-    """Builds the page on `server`; `start` begins to draw, `close` ends it.
+    """Builds the page on `server`; `start` begins drawing, `close` ends it.
 
     Args:
-        server: whose page this is. forks: where snapshots come from and commands go.
+        server: serves the page. forks: provides snapshots and takes commands.
         folders: where recordings may be opened from. point_budget: of the engine's reader, shown to the user.
         results: folder below which results are saved.
-        now: monotonic seconds. calibrate: begin calibrations without being asked, where they help.
+        now: monotonic seconds. calibrate: begin calibrations automatically where they help.
         resolve: see `CalibrationPanel`.
     """
 
@@ -158,7 +158,7 @@ class Workbench:
         self._drawn: Snapshot | None = None
         self._scene_due, self._legend_due = Changes(now, SCENE_PERIOD_S), Changes(now, PANEL_PERIOD_S)
         self._tuned_at = -_TUNING_S
-        self._tuned: tuple[int, View] | None = None  # frame and look since then: the map stays dimmed with these
+        self._tuned: tuple[int, View] | None = None  # frame and view since then: the map stays dimmed while both last
         self._more = 0
         self._now = now
         self._stop = threading.Event()
@@ -168,7 +168,7 @@ class Workbench:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop drawing; the page stays as it is until its server stops."""
+        """Stop drawing; the page stays unchanged until its server stops."""
         self._stop.set()
         for working in (self._calibration, self._tune, self._map_compare, self._pictures):
             working.close()
@@ -187,7 +187,7 @@ class Workbench:
                 time.sleep(PANEL_PERIOD_S)
 
     def draw(self, current: Snapshot) -> None:
-        """Bring the page up to `current`: the scene first, since changed parameters show there."""
+        """Update the page to `current`: the scene first, since it shows the effect of changed parameters."""
         view = self._study.seen(self._loops.seen(self._appearance.view))
         self._compare.draw(current, view)
         view = self._clip.seen(current, self._map_compare.seen(current, self._compare.seen(view)))
@@ -203,32 +203,32 @@ class Workbench:
             one.draw(current)
 
     def _lines(self, current: Snapshot, view: View) -> list[tuple[Rgb, str]]:
-        """Colours and names of the lines in the scene, and of the submaps of a loop that is looked at."""
+        """Colours and names of the lines in the scene, and of the submaps of an inspected loop."""
         truth = current.recording is not None and current.recording.truth_positions is not None
         path = [(PATH_COLOUR, "path")] + [(TRUTH_COLOUR, "truth")] * truth if view.path else []
         dimmed = [(DIMMED[view.light], "map, while ground sliders move")] if view.tuning and view.map else []
         return [*self._loops.keys(current, view.light), *path, *dimmed]
 
     def clicked(self, event: viser.SceneClickEvent) -> None:
-        """A click in the scene is for the first panel that takes it."""
+        """Offer a click in the scene to the panels in turn, until one takes it."""
         for one in (self._measure, self._brush, self._notes, self._loops, self._study):
             if one.clicked(event):
                 return
 
     def _look_freely(self, client: viser.ClientHandle) -> None:
-        """A browser's camera is sent somewhere else and is to stay there."""
+        """Prepare for a browser's camera to be sent elsewhere and to stay there."""
         self._appearance.look_freely(client)
         self._scene.framing.leave(client)
 
     def _opened(self, tab: str) -> None:
-        """Another tab, or "" for Escape, ends what was looked at under the one before. View changes only looks."""
+        """When another tab opens, or on Escape (""), end the inspection of the previous tab, except under View."""
         if tab not in ("Loops", "View"):
             self._loops.choose(None)
         if tab != "Parameters":
             self._tuned_at, self._tuned = -_TUNING_S, None
 
     def _draw_scene(self, current: Snapshot, view: View) -> View:
-        """Returns the view as drawn."""
+        """Draw the scene. Returns the view as drawn."""
         drawn = self._drawn
         tuned = drawn is None or drawn.params != current.params
         if drawn is not None and drawn.session == current.session and drawn.params.ground != current.params.ground:
