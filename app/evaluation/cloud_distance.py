@@ -1,8 +1,8 @@
-"""How far one map lies in front of another, along the surface's normal, and the smallest distance that is not chance.
+"""Distances between two maps along the surface normal, and the level of detection: a smaller distance may be chance.
 
 After M3C2: Lague, Brodu, Leroux 2013, "Accurate 3D comparison of complex topography with terrestrial laser scanner".
-Unlike there, each point has the smallest scale at which its surroundings are a plane, and only the nearest layer of the
-other map counts: behind a thin wall there is often another surface.
+Two differences: each point uses the smallest scale at which its surroundings are planar, and only the nearest layer of
+the other map counts, because there is often another surface behind a thin wall.
 """
 
 from collections.abc import Callable
@@ -19,25 +19,25 @@ from app.slam.kernels import cells
 from app.slam.types import F32, F64, I64
 
 THIN_M: Final = 0.01
-"""Maps are thinned to this when read: a wider voxel would pull means towards the middle of voxels."""
+"""Maps are thinned to voxels of this size when read; with larger voxels, means would shift to the voxels' middles."""
 CORE_M: Final = 0.1
-"""Distances are measured once in each voxel of this size."""
+"""One distance is measured in each voxel of this size."""
 RADII_M: Final = np.array([0.1, 0.2, 0.4])
 LEAST: Final = 5
-"""Fewest points that a mean is computed from."""
+"""Fewest points from which a mean is computed."""
 REACH_M: Final = 0.5
-"""Farther surfaces are not the same one."""
+"""Surfaces farther apart do not count as the same surface."""
 _FIT_VOXEL_M: Final = 0.2
 _FIT_REACH_M: Final = 2.0
 _FARTHEST_M: Final = 1000.0
-"""Points farther outside the other map lie nowhere near it, and small_gicp warns of each beyond 200 km."""
+"""Points farther outside the other map are ignored; small_gicp would warn about each point beyond 200 km."""
 _EDGE_M: Final = 0.2
 _BATCH: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """Points sorted by the cube they lie in: points (n, 3) f32; keys (m,) i64; starts (m + 1,) i64; edge, m."""
+    """Points sorted by the cube that contains them: points (n, 3) f32; keys (m,) i64; starts (m + 1,) i64; edge, m."""
 
     points: F32
     keys: I64
@@ -54,7 +54,7 @@ def sorted_cells(points: F32, edge: float) -> Cells:
 
 
 def density(points: F32, edge: float = 0.25) -> F32:
-    """(n,) how many of (n, 3) points are in a cube of about two edges around each."""
+    """(n,) number of points in a cube of about two edges around each of (n, 3) points."""
     found, out = sorted_cells(points, edge), np.empty(len(points), np.int32)
     cells.count_around(points, found.keys, found.starts, edge, out)
     return out.astype(np.float32)
@@ -62,13 +62,13 @@ def density(points: F32, edge: float = 0.25) -> F32:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Distances of a map from another one.
+    """Distances of a map from another map.
 
     Attributes:
-        distance: (n,) m, of each point: positive where it lies in front of the other surface, towards the sensor; nan
-            where the other map has no surface within reach.
-        detectable: (n,) m, the level of detection at 95 %: a smaller distance may be chance. nan as well.
-        T: (4, 4) by which the other map was moved before.
+        distance: (n,) m, of each point: positive in front of the other surface, towards the sensor; NaN where the
+            other map has no surface within reach.
+        detectable: (n,) m, the level of detection at 95 %: a smaller distance may be chance. NaN likewise.
+        T: (4, 4) by which the other map was moved before the comparison.
     """
 
     distance: F32
@@ -77,7 +77,7 @@ class Comparison:
 
     @cached_property
     def known(self) -> F32:
-        """(k,) m, the distances that are."""
+        """(k,) m, the distances that are not NaN."""
         return self.distance[np.isfinite(self.distance)]
 
     @property
@@ -87,7 +87,7 @@ class Comparison:
 
     @property
     def changed(self) -> float:
-        """Share of those whose distance is more than chance."""
+        """Share of these points whose distance is more than chance."""
         return float(np.count_nonzero(np.abs(self.distance) > self.detectable)) / max(len(self.known), 1)
 
     @property
@@ -118,12 +118,12 @@ def compare(
 
     Args:
         points: (n, 3) m, of the map. sensors: (n, 3) m, from where each was seen. other: (k, 3) m.
-        reach: m, the farthest that counts.
-        fit: move the other map first, so that both lie on each other as well as they can.
+        reach: m, largest distance that counts.
+        fit: first move the other map for the best fit.
         progress: called with the share that is done, 0-1.
 
     Raises:
-        HemislamError: a map has no points, or they do not lie on each other.
+        HemislamError: a map has no points, or the maps do not overlap.
     """
     if not len(points) or not len(other):
         raise HemislamError("A map without points cannot be compared.")
@@ -162,7 +162,7 @@ def _keys(points: F32, edge: float) -> I64:
 
 
 def _fitted(mine: F32, theirs: F32) -> F64:
-    """(4, 4), what moves their points onto mine (Segal 2009, generalised ICP)."""
+    """(4, 4), transform of their points onto mine (Segal 2009, generalised ICP)."""
     theirs = theirs[(np.abs(theirs) < np.abs(mine).max() + _FARTHEST_M).all(axis=1)]
     if len(theirs):
         found = small_gicp.align(

@@ -1,10 +1,10 @@
 """Runs jobs on an existing Dask cluster (https://distributed.dask.org). Its scheduler and workers are the user's.
 
-A worker runs a job in a folder of its own and sends the files back; they are written here, as if run here. Recordings
-are read from their own path where workers have it, else from an fsspec URL, else they are copied to the workers.
+A worker runs a job in a folder of its own and sends the files back; they are written here, as if the job had run here.
+A worker reads a recording from its original path if it can, else from an fsspec URL; else it gets a copy.
 
-A job is given to one worker that has nothing else to do, not to the cluster as a whole. So workers may join at any
-time, and each is asked for its version and the recording before it gets work.
+A job is given to one idle worker, not to the cluster as a whole. So workers may join at any time, and the version and
+the recording of each worker are checked before it gets work.
 """
 
 import contextlib
@@ -31,17 +31,17 @@ from app.slam.provenance import hash_input
 
 CONNECT_S = 15.0
 LOOK_S = 0.5
-"""How often it is looked whether workers have come or gone."""
+"""How often to check whether workers have joined or left."""
 TAKE_S = 20.0
-"""How long a worker may take to hand over the files of a run. One that is dead never does."""
+"""How long a worker may take to hand over the files of a run. A dead worker never does."""
 PIECE = 16 << 20
 """Bytes of a recording that are sent at a time."""
 MOST_DEATHS = 3
-"""A job during which this many workers died is not tried again."""
+"""A job is given up after this many workers died while running it."""
 
 
 class _Gone(Exception):
-    """The scheduler or all workers are gone, or not there yet. `str` says it in a sentence."""
+    """The scheduler or all workers are gone, or not there yet. `str` gives a sentence for the user."""
 
 
 class _Died(Exception):
@@ -53,7 +53,7 @@ class Cluster:
     """Attributes:
     address: of the scheduler, such as tcp://scheduler:8786.
     url: folder of the recordings for workers that do not have their path, such as s3://bucket/walks; "" for none.
-    wait_s: how long a scheduler or workers that are gone may take to come back.
+    wait_s: how long to wait for the return of a scheduler or of workers that are gone.
     """
 
     address: str
@@ -71,7 +71,7 @@ class Cluster:
         try:
             with self._client() as client:
                 _checked(client, _workers(client))
-        except _Gone as gone:  # at first the cluster must be there
+        except _Gone as gone:  # at the start, the cluster must be there
             raise HemislamError(str(gone)) from None
         patient_until, told = time.monotonic() + self.wait_s, ""
         with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
@@ -96,7 +96,7 @@ class Cluster:
         return errors
 
     def _results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str]]:
-        """Jobs as they end, and why they failed. Raises _Gone."""
+        """Yield jobs as they end, with the reason if they failed. Raises _Gone."""
         waiting, running = deque(jobs), dict[str, tuple[Job, Any]]()
         deaths, news = Counter[Path](), threading.Event()
         with self._client() as client:
@@ -127,11 +127,11 @@ class Cluster:
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:
-        """Connected, with a worker at least. Raises _Gone: the scheduler cannot be reached, or not any more."""
+        """A connected client with at least one worker. Raises _Gone: the scheduler cannot be reached, or was lost."""
         from distributed import Client
         from distributed.comm import CommClosedError
 
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it would say comes as a sentence from here
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported here in a sentence instead
         gone = f"There is no Dask scheduler at {self.address}; start one with `dask scheduler`."
         try:
             client = Client(self.address, timeout=CONNECT_S, set_as_default=False)
@@ -147,12 +147,12 @@ class Cluster:
             client.close(timeout=5)
 
     def _bring(self, client: Any, worker: str, job: Job) -> None:
-        """Copy a job's recording to a worker that can have it from nowhere else, piece by piece. Raises _Died."""
+        """Copy a job's recording piece by piece to a worker that has no other access to it. Raises _Died."""
         if self.url or _ask(client, worker, _has, job):
             return
         if job.recording.is_dir():
             raise HemislamError(
-                f"Worker {worker} cannot read {job.recording}, and folders are not copied; put it where it can."
+                f"Worker {worker} cannot read {job.recording}, and folders are not copied; make it readable there."
             )
         with job.recording.open("rb") as file:
             while piece := file.read(PIECE):
@@ -162,7 +162,7 @@ class Cluster:
 
 
 def _ask(client: Any, worker: str, function: Callable[..., Any], *about: Any) -> Any:
-    """What the function gives on this worker. Raises _Died."""
+    """Call the function on this worker and return its result. Raises _Died."""
     answer = client.run(function, *about, workers=[worker], on_error="return").get(worker, OSError())
     if isinstance(answer, OSError):
         raise _Died
@@ -172,7 +172,7 @@ def _ask(client: Any, worker: str, function: Callable[..., Any], *about: Any) ->
 
 
 def _workers(client: Any) -> dict[str, Any]:
-    """What the scheduler knows of its workers, by address. Raises _Gone: there is none."""
+    """The scheduler's information on its workers, by address. Raises _Gone: there is none."""
     workers = dict(client.scheduler_info(n_workers=-1).get("workers", {}))
     if not workers:
         raise _Gone("The Dask cluster has no workers; start some with `dask worker ADDRESS --nthreads 1`.")
@@ -180,10 +180,10 @@ def _workers(client: Any) -> dict[str, Any]:
 
 
 def _checked(client: Any, workers: dict[str, Any]) -> list[str]:
-    """Addresses of those that answer and can be used.
+    """Addresses of the workers that answer and can be used.
 
     Raises:
-        HemislamError: one has another version or no hemislam, or runs jobs beside each other.
+        HemislamError: a worker has another version or no hemislam, or runs several jobs at a time.
     """
     good = []
     for worker, version in (client.run(_version, workers=list(workers), on_error="return") if workers else {}).items():
@@ -207,16 +207,16 @@ def _checked(client: Any, workers: dict[str, Any]) -> list[str]:
 
 
 def _taken(job: Job, future: Any) -> str | None:
-    """Write what a worker gave. Raises _Gone.
+    """Write the files from a worker. Raises _Gone.
 
     Returns:
-        "" if there is something, why there is nothing, or None: the worker died before it handed the files over.
+        "" if there are files, else why there are none; None: the worker died before it handed the files over.
     """
     if future.status == "cancelled":
         raise _Gone("The Dask scheduler is gone; start it and its workers again.")
     try:
         files = future.result(timeout=TAKE_S)
-    except Exception as error:  # whatever went wrong there; Dask raises what the worker raised
+    except Exception as error:  # anything may have gone wrong there; Dask re-raises the worker's error
         if isinstance(error, TimeoutError) and future.status != "error":
             return None
         return f"The worker failed: {str(error) or type(error).__name__}"
@@ -244,7 +244,7 @@ def _is_it(path: Path, sha256: str) -> bool:
 
 @cache
 def _hash(path: Path, size: int, changed_ns: int) -> str | None:
-    """Hash of a recording, computed anew only if it has changed."""
+    """Hash of a recording, computed again only if the file has changed."""
     return hash_input(path)
 
 
@@ -254,7 +254,7 @@ def _copy_of(job: Job) -> Path:
 
 
 def _part_of(job: Job) -> Path:
-    """A copy in the making, of this worker's own: others on the same machine may be making theirs."""
+    """This worker's unfinished copy; other workers on the same machine may be writing their own."""
     copy = _copy_of(job)
     copy.parent.mkdir(exist_ok=True)
     return copy.with_name(f"{copy.name}.part-{os.getpid()}")
@@ -271,12 +271,12 @@ def _append(job: Job, offset: int, piece: bytes) -> str:
 
 
 def _settle(job: Job) -> None:
-    """All pieces are there."""
+    """All pieces have arrived: give the copy its final name."""
     _part_of(job).replace(_copy_of(job))
 
 
 def _work(job: Job, url: str) -> dict[str, bytes] | str:
-    """On a worker: the files of a finished run, or why there are none."""
+    """Run a job on a worker. Returns the files of the finished run, or why there are none."""
     with tempfile.TemporaryDirectory(prefix="hemislam-job-") as folder:
         try:
             there = replace(job, recording=_found(job, url), folder=Path(folder) / "run")
@@ -291,10 +291,10 @@ def _work(job: Job, url: str) -> dict[str, bytes] | str:
 
 
 def _found(job: Job, url: str) -> Path:
-    """Where this worker has the recording; fetched from the URL if need be.
+    """Path of the recording on this worker; it is fetched from the URL if necessary.
 
     Raises:
-        HemislamError: there is none with the right content, or it cannot be fetched.
+        HemislamError: there is no recording with the right content, or it cannot be fetched.
     """
     if _is_it(job.recording, job.sha256):
         return job.recording
@@ -317,10 +317,10 @@ def _fetch(address: str, job: Job) -> None:
     part = _part_of(job)
     try:
         system, path = url_to_fs(address)
-        system.get_file(path, str(part))  # also from servers that give files as a whole only
-    except Exception as error:  # each kind of address has its own
+        system.get_file(path, str(part))  # also works with servers that only send whole files
+    except Exception as error:  # each kind of address raises its own errors
         part.unlink(missing_ok=True)
-        # fsspec says "not found" where, say, a certificate is not trusted, and what to install for gs:// or s3://
+        # fsspec says "not found" even for, say, an untrusted certificate; for gs:// or s3://, it says what to install
         cause = None if isinstance(error, ImportError) else error.__cause__
         why = cause or ("it is not there" if isinstance(error, FileNotFoundError) else error)
         raise HemislamError(f"The worker cannot fetch {address}: {str(why) or type(why).__name__}") from None

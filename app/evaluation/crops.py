@@ -1,4 +1,4 @@
-"""Pieces of the map from above, at the same place in every variant, to compare side by side."""
+"""Pieces of the map from above, at the same places in every variant, for comparison side by side."""
 
 from collections.abc import Iterable
 
@@ -9,10 +9,10 @@ from app.slam.types import F64, U16, Keyframe
 HALF_M = 9.0
 PIXEL_M = 0.05
 SLICE_M = (-0.6, 0.7)
-"""Heights above the sensor: walls and trunks show as lines, floor and ceiling stay out."""
+"""Heights relative to the sensor: walls and trunks appear as lines, without floor and ceiling."""
 REACH_M = 15.0
 PLACES = {"start": 0.0, "half way": 0.5}
-"""By share of the recording's time. A trajectory that returns shows both passes at its start."""
+"""Share of the recording's duration at each place. If a trajectory returns, its start shows both passes."""
 
 
 def crop(keyframes: Iterable[Keyframe], poses: F64, centre: F64) -> U16:

@@ -1,4 +1,4 @@
-"""What `hemislam evaluate` does: plan the runs, run them, measure them, report."""
+"""The work of `hemislam evaluate`: plan the runs, run them, measure them, and write the report."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ from app.slam.types import F64
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """One recording to be evaluated.
+    """A recording to evaluate.
 
     Attributes:
-        name: in tables, without `/`. params: before the variants. truth: to measure against.
-        compared: other systems' trajectories by name, in the recording's clock. marks: as `Job` has them.
+        name: in tables, without `/`. params: to which variants apply their changes. truth: to measure errors against.
+        compared: other systems' trajectories by name, in the recording's clock. marks: as in `Job`.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Subject:
 
 
 def check_subject(subject: Subject, start_s: float = 0.0) -> str:
-    """The hash of its recording. start_s: of the part that is asked for.
+    """Check that it can be evaluated; returns the hash of its recording. start_s: start of the requested part.
 
     Raises:
         HemislamError: the recording cannot be used or ends before that part, or its truth is from another time.
@@ -62,7 +62,7 @@ def evaluate(
     start_s: float = 0.0,
     duration_s: float | None = None,
 ) -> tuple[list[str], dict[tuple[str, str], str]]:
-    """Run what is not finished and write the report.
+    """Run the unfinished jobs and write the report.
 
     Args:
         folder: for the report and the runs. run: runs the jobs.
@@ -124,7 +124,7 @@ def _measured(subject: Subject, sha256: str, outcomes: list[Outcome]) -> Evaluat
 
 
 def _path(truth: Trajectory, outcomes: Sequence[Outcome]) -> F64:
-    """The truth, (n, 3) m, over the time that was compared."""
+    """(n, 3) m, the truth over the compared time."""
     stamps = np.concatenate([o.trajectory.stamps_ns for o in outcomes if o.accuracy and o.trajectory is not None])
     inside = (truth.stamps_ns >= stamps.min()) & (truth.stamps_ns <= stamps.max())
     return np.asarray(truth.positions[inside])

@@ -19,7 +19,7 @@ from app.slam.types import F64, STAGES, U16
 
 PALETTE = ("#2563eb", "#ea580c", "#16a34a", "#9333ea", "#dc2626", "#0891b2", "#ca8a04", "#db2777")
 TRUTH = "var(--ink)"
-"""Of the page, light or dark."""
+"""Colour of the page's text, light or dark."""
 _MOST_POINTS = 700
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 560, 56, 14, 12, 40
 _TEMPLATES = Environment(
@@ -33,7 +33,7 @@ _TEMPLATES = Environment(
 
 
 def _tex(text: str) -> str:
-    """Text as LaTeX shows it."""
+    """Escape a text for LaTeX."""
     signs = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
     signs |= {"°": r"\textdegree{}"} | {sign: f"\\{sign}" for sign in "&%$#_{}"}
     return "".join(signs.get(sign, sign) for sign in text)
@@ -43,13 +43,13 @@ _TEMPLATES.filters["tex"] = _tex
 
 
 def render(template: str, **values: Any) -> str:
-    """A file of the folder `templates`, filled in."""
+    """Fill in a file of the folder `templates`."""
     return _TEMPLATES.get_template(template).render(**values)
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line of a chart through (n,) points x, y."""
+    """A line of a chart through (n,) points x, y."""
 
     name: str
     colour: str
@@ -67,7 +67,7 @@ def chart(
     from_zero: bool = False,
     height: int = 300,
 ) -> Markup:
-    """Lines over axes, later ones thinner, so that those below them show.
+    """A line chart; later lines are thinner, so that the lines below remain visible.
 
     `equal`: the same scale on both axes, as for a map. `from_zero`: the y axis begins at 0.
     """
@@ -104,7 +104,7 @@ def chart(
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """How values are distributed: a shape of half widths (n,) 0-1 at `values` (n,), a line from `low` to `high`, and a
+    """A distribution of values: a shape with half widths (n,) 0-1 at `values` (n,), a line from `low` to `high`, and a
     mark at the median."""
 
     name: str
@@ -117,13 +117,13 @@ class Body:
 
 
 def box(name: str, colour: str, values: F64) -> Body:
-    """The quartiles as a box, and a line from 5 to 95 %."""
+    """A box at the quartiles, and a line from 5 to 95 %."""
     low, first, middle, third, high = np.percentile(values, [5, 25, 50, 75, 95])
     return Body(name, colour, np.array([first, third]), np.ones(2), low, high, middle)
 
 
 def violin(name: str, colour: str, values: F64) -> Body:
-    """As wide as values are frequent, on a logarithmic scale, from 0.5 to 99.5 %."""
+    """A shape as wide as values are frequent, on a logarithmic scale, from 0.5 to 99.5 %."""
     low, middle, high = np.percentile(values, [0.5, 50, 99.5])
     edges = np.geomspace(0.9 * low, 1.1 * high, 65)
     counts = np.histogram(values, edges)[0].astype(np.float64)
@@ -132,7 +132,7 @@ def violin(name: str, colour: str, values: F64) -> Body:
 
 
 def bodies(groups: Sequence[tuple[str, Sequence[Body]]], x_label: str, y_label: str) -> Markup:
-    """Groups of distributions side by side over a logarithmic axis; `groups`: their names and bodies."""
+    """Groups of distributions side by side on a logarithmic axis; `groups`: names and bodies."""
     height, right = 300, _WIDTH - _RIGHT
     bottom = height - _BOTTOM
     every = [body for _, group in groups for body in group]
@@ -164,7 +164,7 @@ def bodies(groups: Sequence[tuple[str, Sequence[Body]]], x_label: str, y_label: 
 
 
 def stacked(rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], unit: str) -> Markup:
-    """Horizontal bars, one per row, of several parts each."""
+    """Horizontal bars, one per row, each of several parts."""
     longest = max((sum(values) for _, values in rows), default=0.0) or 1.0
     left, scale = 110.0, 350 / longest
     drawn = []
@@ -181,7 +181,7 @@ def stacked(rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], u
 def density_image(counts: U16, densest: float) -> str:
     """Points per pixel as a PNG in a data URL, light to dark on a logarithmic scale up to `densest`."""
     level = np.log1p(counts.astype(np.float64)) / np.log1p(max(densest, 1.0))
-    level = np.where(counts > 0, 0.45 + 0.55 * level, 0.0)  # a single point is visible too
+    level = np.where(counts > 0, 0.45 + 0.55 * level, 0.0)  # make single points visible too
     stops = np.array([[255, 255, 255], [168, 200, 236], [84, 140, 210], [38, 78, 158], [12, 18, 58]])
     ramp = [np.interp(np.linspace(0, 1, 256), np.linspace(0, 1, 5), stops[:, channel]) for channel in range(3)]
     image = Image.fromarray(np.rint(255 * level.clip(0, 1)).astype(np.uint8))
@@ -215,7 +215,7 @@ def _ticks(low: float, high: float, count: int) -> list[float]:
 
 # --- what is shown of a recording -----------------------------------------------------------------
 Legend = list[tuple[str, str]]
-"""Names and their colours."""
+"""Names with their colours."""
 
 CROP_NOTE = (
     f"{2 * crops.HALF_M:g} × {2 * crops.HALF_M:g} m from above, from {crops.SLICE_M[0]:+g} to {crops.SLICE_M[1]:+g} m"
@@ -232,7 +232,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """Of one recording. `maps`: by place, names and data URLs of the same piece of each variant's map."""
+    """The figures of a recording. `maps`: by place, names and data URLs of that piece of each variant's map."""
 
     legend: Legend
     figures: list[Figure]
@@ -240,7 +240,7 @@ class Pictures:
 
 
 def colours(recordings: Sequence[Evaluated]) -> dict[str, str]:
-    """A colour for each outcome's name, the same in all pictures."""
+    """A colour for each outcome's name, the same in all figures."""
     names = dict.fromkeys(outcome.name for r in recordings for outcome in r.outcomes if not outcome.missing)
     return {name: PALETTE[index % len(PALETTE)] for index, name in enumerate(names)}
 

@@ -1,4 +1,4 @@
-"""What the tables show, in sentences: where they confirm the paper and where they contradict it."""
+"""Findings of a report in sentences: where the tables confirm the paper, and where they contradict it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ LIKE, LIKE_IN_TIME = 0.02, 0.05
 MOST_TOLD = 5
 """Number of sentences at the top of a report."""
 MOST_NAMED = 4
-"""Most recordings that are named when they differ; of more, only the number is given."""
+"""At most this many differing recordings are named; of more, only the number is given."""
 CHANCE = 2.0
-"""A mean difference of fewer standard errors than this, over the recordings, may be chance."""
+"""A mean difference of less than this many standard errors over the recordings may be chance."""
 
 MANY = 10
-"""A difference by more than this factor is not given in per cent."""
+"""A difference by more than this factor is given as a factor, not in percent."""
 
 _SAME = "stays the same"
 _CLAIMS = (
@@ -31,8 +31,8 @@ _CLAIMS = (
 @dataclass(frozen=True, slots=True)
 class Claim:
     """Attributes:
-    size: share by which a value changes, 0 if that may be chance; inf where something went wrong.
-    own: it is about a variant of the user's.
+    size: relative change of a value, 0 if it may be chance; inf if something went wrong.
+    own: whether it is about a variant of the user.
     """
 
     text: str
@@ -41,7 +41,7 @@ class Claim:
 
 
 def findings(recordings: Sequence[Evaluated]) -> list[str]:
-    """One sentence each, the biggest difference first; every variant of the user's is among the first `MOST_TOLD`."""
+    """One sentence each, the largest difference first; the user's variants are among the first `MOST_TOLD`."""
     found = _own(recordings) + _mishaps(recordings)
     for name, base, what in _CLAIMS:
         for metric in _METRICS:
@@ -60,7 +60,7 @@ def findings(recordings: Sequence[Evaluated]) -> list[str]:
 
 
 def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
-    """The user's variants against ours; those without a difference are named together."""
+    """The user's variants compared with ours; variants without a difference share one sentence."""
     outcomes = {o.name: o for recording in recordings for o in recording.outcomes if o.run is not None}
     names = [name for name in outcomes if name not in {variant.name for variant in PAPER}]
     base = "Ours" if "Ours" in outcomes else next(iter(outcomes), "")
@@ -82,7 +82,7 @@ def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
 
 
 def _mishaps(recordings: Sequence[Evaluated]) -> list[Claim]:
-    """What is missing or went wrong."""
+    """Everything that is missing or went wrong."""
     found = []
     missing: dict[str, list[str]] = {}
     straight = []
@@ -110,8 +110,8 @@ def _mishaps(recordings: Sequence[Evaluated]) -> list[Claim]:
 @dataclass(frozen=True, slots=True)
 class _Metric:
     """Attributes:
-    path: of its value, as for `Outcome.value`. where: how the names of the recordings begin that the paper speaks of.
-    promised: whether the paper found that the value falls. like: share up to which two values count as equal.
+    path: of its value, as for `Outcome.value`. where: prefix of the names of the recordings concerned.
+    promised: whether the paper found that the value falls. like: relative difference below which values count as equal.
     """
 
     name: str
@@ -125,13 +125,13 @@ class _Metric:
 
 _ATE = "accuracy/ate_m/rmse"
 _CPU = "runtime_ms/cpu/mean"
-"""CPU time, which other programs on the machine disturb least."""
+"""CPU time: the time least disturbed by other programs on the machine."""
 _METRICS = (
     _Metric("error (ATE)", _ATE, "m", ".3g"),
     _Metric("error (ATE) outdoors", _ATE, "m", ".3g", where="outdoor"),
     _Metric(f"error (ATE) without the first {START_S:g} s", "accuracy/ate_after_start_m", "m", ".3g"),
     _Metric("CPU time per frame", _CPU, "ms", ".2f", promised=False, like=LIKE_IN_TIME),
-    # Table 3: outdoors, where much is ground, thinning it should make up for most of what it costs
+    # Table 3: outdoors, where much of a scan is ground, thinning the ground should recover most of its cost
     _Metric("CPU time per frame outdoors", _CPU, "ms", ".2f", where="outdoor", promised=False, like=LIKE_IN_TIME),
 )
 
@@ -146,7 +146,7 @@ _OWN_METRICS = (
 @dataclass(frozen=True, slots=True)
 class _Difference:
     """Attributes:
-    words: how the mean of a metric differs. size: see `Claim`. against: it got worse. rest: where it rises.
+    words: how the mean of a metric differs. size: see `Claim`. against: whether it got worse. rest: where it rises.
     """
 
     words: str
@@ -156,7 +156,7 @@ class _Difference:
 
 
 def _difference(recordings: Sequence[Evaluated], name: str, base: str, metric: _Metric) -> _Difference | None:
-    """`name` against `base`, over all recordings that have both; None if none has."""
+    """`name` compared with `base` over all recordings that have both; None if there is no such recording."""
     pairs = []
     for recording in recordings:
         outcomes = {outcome.name: outcome for outcome in recording.outcomes}
@@ -195,7 +195,7 @@ def _certainty(pairs: Sequence[tuple[str, float, float]]) -> tuple[str, bool]:
 
 
 def _compare(ours: float, theirs: float, like: float) -> tuple[str, bool]:
-    """In words, and whether it got worse."""
+    """The difference in words, and whether the value got worse."""
     if abs(ours - theirs) <= like * max(abs(theirs), 1e-9):
         return _SAME, False
     if theirs == 0:

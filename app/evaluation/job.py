@@ -1,7 +1,7 @@
-"""What is run: one recording with one variant or baseline, and the files that are left.
+"""A job: one recording with one variant or baseline, and the files that its run writes.
 
-A run's folder holds trajectory.tum, timings.csv, crops.npz and, written last, run.json with the key
-of all that the results depend on: a folder with the right key is finished and never run again.
+A run's folder holds trajectory.tum, timings.csv, crops.npz and, written last, run.json with a key that covers
+everything on which the results depend. A folder with the right key is finished and is never run again.
 """
 
 import hashlib
@@ -18,15 +18,15 @@ from app.slam.params import Params
 
 FORMAT = 3
 LEAD_S = 5.0
-"""Reading usually begins this much before a part in the middle of a recording, and what comes before the part does not
-count. A start while walking has no rest to level by: its error is larger than the effect of any parameter."""
+"""Reading usually begins this much before a part in the middle of a recording; this lead does not count. A start while
+walking has no rest by which to level the map: its error would be larger than the effect of any parameter."""
 GROUND_RANGES_M = (0.0, 5.0, 10.0, 20.0, 40.0, 100.0)
 RUN_FILES = ("trajectory.tum", "timings.csv", "crops.npz", "run.json")
 
 
 @cache
 def code_digest() -> str:
-    """Hash of the code that results depend on, so that a change of it runs jobs again."""
+    """Hash of the code on which results depend, so that jobs run again after a change."""
     root = Path(__file__).parents[1]
     files = [path for room in ("slam", "mapping", "baselines") for path in (root / room).rglob("*.py")]
     files += [path for path in (root / "sensors").rglob("*.py") if "simulator" not in path.parts]
@@ -41,13 +41,13 @@ def code_digest() -> str:
 @dataclass(frozen=True, slots=True)
 class Job:
     """Attributes:
-    recording: its path, sha256: of its bytes. name: of the recording in tables. variant: its name.
-    params: as run. folder: for the results. code: `code_digest()`.
+    recording: its path. sha256: of its bytes. name: of the recording in tables. variant: its name.
+    params: all parameters of the run. folder: for the results. code: `code_digest()`.
     start_s, duration_s: the part of the recording that counts, after its first scan; None: to the end.
-    lead_s: how much earlier reading begins, at most.
-    baseline: name of the system that is run in place of the engine; "" for the engine.
-    marks: (stamp of a frame, a byte for each point of its cloud as in `app.mapping.painted`), in place of the
-        recording's labels of ground.
+    lead_s: reading begins up to this much earlier.
+    baseline: name of the system that replaces the engine; "" for the engine.
+    marks: (stamp of a frame, one byte per point of its cloud as in `app.mapping.painted`); they replace the
+        recording's ground labels.
     """
 
     recording: Path
@@ -63,7 +63,7 @@ class Job:
     baseline: str = ""
     marks: tuple[tuple[int, bytes], ...] = ()
     key: str = field(init=False)
-    """Hash of all that a result depends on, the machine and its load aside."""
+    """Hash of everything on which a result depends, except the machine and its load."""
 
     def __post_init__(self) -> None:
         parts = {
@@ -77,27 +77,27 @@ class Job:
             "marks": [[stamp, hashlib.sha256(labels).hexdigest()] for stamp, labels in self.marks],
         }
         key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-        object.__setattr__(self, "key", key)  # once, where the job is made, so that its process agrees
+        object.__setattr__(self, "key", key)  # once, by its maker, so that all processes agree
 
     @property
     def read(self) -> tuple[float, float | None]:
-        """Start and length of what is read, the part with its lead, s."""
+        """Start and length (s) of the part to read, including the lead."""
         lead = min(self.lead_s, self.start_s)
         return self.start_s - lead, None if self.duration_s is None else self.duration_s + lead
 
     def begin_ns(self, info: FeedInfo) -> int:
-        """When the part begins."""
+        """Time at which the part begins."""
         return info.start_ns + round(self.start_s * 1e9)
 
 
 def finished(job: Job) -> dict[str, Any] | None:
-    """What run.json holds, if the job was run to its end with just these inputs."""
+    """The content of run.json if the job was completed with exactly these inputs; otherwise None."""
     report = read_run(job.folder)
     return report if report is not None and report.get("key") == job.key else None
 
 
 def read_run(folder: Path) -> dict[str, Any] | None:
-    """What run.json of a run's folder holds; None if it cannot be read or a file of the run is missing."""
+    """The content of run.json in a run's folder; None if it cannot be read or a file of the run is missing."""
     try:
         report = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -107,6 +107,6 @@ def read_run(folder: Path) -> dict[str, Any] | None:
 
 
 def reopen(job: Job) -> None:
-    """Its folder, not finished any more. run.json is written last, so a kill before that leaves no result."""
+    """Make the job's folder, marked unfinished. run.json is written last, so a kill before that leaves no result."""
     job.folder.mkdir(parents=True, exist_ok=True)
     (job.folder / "run.json").unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Comparing the map of a session with another one, or with itself on the true trajectory, in a process of its own."""
+"""Compare a session's map with another map, or with itself on the true trajectory, in a process of its own."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,15 +22,15 @@ from app.slam.trajectory import Trajectory
 from app.slam.types import F32, F64
 
 _OF_A_GRID_M: Final = 20_000.0
-"""Coordinates beyond this are those of a grid on Earth, since no walk reaches that far."""
+"""Coordinates beyond this are grid coordinates on Earth, since no walk reaches that far."""
 _ABOVE_M: Final = 100.0
 _READ: Final = 0.3
-"""Share of the work that goes into reading the other map."""
+"""Share of the progress for reading the other map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframePoints:
-    """A keyframe's points: (n, 3) m, LiDAR frame. stamp_ns: of its pose T_map_imu; T_imu_lidar: (4, 4) as well."""
+    """A keyframe's points: (n, 3) m, LiDAR frame. stamp_ns: of its pose T_map_imu; both poses are (4, 4)."""
 
     points: F32
     stamp_ns: int
@@ -40,11 +40,11 @@ class KeyframePoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapsToCompare:
-    """What is compared with the scans' map.
+    """The map of the scans, and what to compare it with.
 
     Attributes:
         other: a map (PLY, LAS, LAZ), or, if `by_truth`, the file of the true trajectory.
-        where: on Earth the map is, for other maps in coordinates of a grid. fit, reach: as in `compare`.
+        where: the map's georeference, for other maps in grid coordinates. fit, reach: as in `compare`.
     """
 
     scans: tuple[KeyframePoints, ...]
@@ -56,7 +56,7 @@ class MapsToCompare:
 
 
 def find(owner: Link, wanted: MapsToCompare) -> None:
-    """Send the share that is done as it grows, then a `Comparison`. Raises HemislamError if there can be none."""
+    """Send the growing share that is done, then a `Comparison`. Raises HemislamError if no comparison is possible."""
     poses = np.array([scan.T_map_imu for scan in wanted.scans])
     points, sensors = placed(wanted.scans, poses)
     if wanted.by_truth:
@@ -74,7 +74,7 @@ def find(owner: Link, wanted: MapsToCompare) -> None:
 
 
 def placed(scans: "tuple[KeyframePoints, ...] | list[KeyframePoints]", poses: F64) -> tuple[F64, F64]:
-    """(n, 3) m, the points in the map by (k, 4, 4) poses T_map_imu, and from where each was seen."""
+    """(n, 3) m, the points in the map by (k, 4, 4) poses T_map_imu, and the position from which each was seen."""
     points, sensors = [np.empty((0, 3))], [np.empty((0, 3))]
     for scan, T_map_imu in zip(scans, poses, strict=True):
         T = T_map_imu @ scan.T_imu_lidar
@@ -84,7 +84,9 @@ def placed(scans: "tuple[KeyframePoints, ...] | list[KeyframePoints]", poses: F6
 
 
 def read_map(path: Path) -> tuple[F64, F64]:
-    """(n, 3) m, the points of a results folder or a file, thinned, and from where each was seen: a file's from above.
+    """(n, 3) m, the thinned points of a results folder or a file, and the positions from which they were seen.
+
+    Points of a file count as seen from above.
 
     Raises:
         HemislamError: it holds no map.
@@ -100,7 +102,7 @@ def read_map(path: Path) -> tuple[F64, F64]:
 
 
 def sentences(found: Comparison, name: str) -> list[str]:
-    """What a comparison with the map `name` found besides distances, in sentences."""
+    """Results of a comparison with the map `name`, besides distances, in sentences."""
     moved = float(np.linalg.norm(found.T[:3, 3]))
     turned = float(np.degrees(np.linalg.norm(lie.log(found.T[:3, :3]))))
     return [
@@ -112,7 +114,7 @@ def sentences(found: Comparison, name: str) -> list[str]:
 
 
 def _true(wanted: MapsToCompare, poses: F64) -> tuple[np.ndarray, F64]:
-    """(k,) which scans have a true pose, and those poses in the map, aligned to the estimated ones."""
+    """(k,) mask of the scans with a true pose, and these poses in the map, aligned to the estimated poses."""
     stamps_ns = np.array([scan.stamp_ns for scan in wanted.scans], np.int64)
     estimate = Trajectory.from_poses(stamps_ns, poses)
     truth = match(read_truth(str(wanted.other)), estimate).trajectory

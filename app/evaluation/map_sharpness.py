@@ -1,11 +1,11 @@
-"""How sharp a map is, in numbers that need no truth (the paper's fineness, shown in pictures in its Figure 7).
+"""Numbers for the sharpness of a map that need no truth (the paper's fineness, shown in its Figure 7).
 
-- Mean map entropy: of the spread of points in a small ball, in nats; lower is sharper
+- Mean map entropy: from the spread of points in small balls, in nats; lower is sharper
   (Droeschel & Behnke, ICRA 2014; Razlaw et al., ECMR 2015).
-- Plane thickness: spread of points across the planes that they form, m.
+- Plane thickness: spread of points perpendicular to the planes that they form, m.
 - Revisit gap: distance between two passes over the same surface, along its normal, m.
 
-Compare maps of the same recording only. Between different trajectories or densities of points the numbers say little.
+Compare only maps of the same recording. Between different trajectories or point densities, the numbers mean little.
 """
 
 import math
@@ -20,7 +20,7 @@ from app.slam import lie
 from app.slam.types import F64, I64, Keyframe
 
 MAX_RANGE_M = 20.0
-"""Points farther from the sensor are too sparse to be used."""
+"""Points farther from the sensor are too sparse to use."""
 POINTS_PER_KEYFRAME = 4000
 BALL_M = 0.3
 BALLS = 5000
@@ -33,8 +33,8 @@ PASS_S, PASS_M = 20.0, 20.0
 @dataclass(frozen=True, slots=True)
 class MapSharpness:
     """Attributes:
-    entropy: mean, nats. thickness: median over planes, m; nan if there are none.
-    revisit_median, revisit_p95: of the gaps, m; nan without a revisit. revisits: surfaces compared.
+    entropy: mean, nats. thickness: median over planes, m; NaN if there are none.
+    revisit_median, revisit_p95: of the gaps, m; NaN without a revisit. revisits: number of surfaces compared.
     """
 
     entropy: float
@@ -47,8 +47,8 @@ class MapSharpness:
 @dataclass(frozen=True, slots=True)
 class MapPoints:
     """Attributes:
-    points: (n, 3) m, map frame. sensors: (n, 3) from where each was seen.
-    times: (n,) s. walked: (n,) m of path at that time.
+    points: (n, 3) m, map frame. sensors: (n, 3) m, position of the sensor for each point.
+    times: (n,) s. walked: (n,) m, path length at that time.
     """
 
     points: F64
@@ -118,9 +118,9 @@ def _crispness(points: F64) -> tuple[float, float]:
 def revisit_gaps(cloud: MapPoints) -> F64:
     """Distances (k,) m along the normal between patches of a surface seen in two passes.
 
-    A patch is what one window of time saw in a voxel of PATCH_M. It is compared with the older patch
-    that faces the same way, at most PATCH_M beside it and 2 PATCH_M above or below it. A larger gap
-    is not recognised as the same surface.
+    A patch is the part of a surface seen in one time window in a voxel of PATCH_M. It is compared with the older patch
+    that faces the same way, at most PATCH_M to the side and 2 PATCH_M along the normal. A larger gap is not recognised
+    as the same surface.
     """
     patches = list(_patches(cloud))
     if not patches:
@@ -152,7 +152,7 @@ def revisit_gaps(cloud: MapPoints) -> F64:
 
 
 def _patches(cloud: MapPoints) -> Iterator[tuple[F64, F64, F64, F64]]:
-    """Centres, normals towards the sensor, times and walked distances of the flat patches, by windows of time."""
+    """Centres, normals towards the sensor, times and walked distances of the flat patches, by time window."""
     if not len(cloud):
         return
     window = np.floor((cloud.times - cloud.times.min()) / (PASS_S / 2)).astype(np.int64)

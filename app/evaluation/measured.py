@@ -18,11 +18,11 @@ from app.slam.trajectory import Trajectory, read_tum
 from app.slam.types import F64, TIMINGS, U16
 
 START_S = 5.0
-"""The start: rest and the first steps. A slip there moves all later poses against the few of the start."""
+"""Duration of the start: rest and first steps. A slip there moves all later poses against the few of the start."""
 PIECES_M = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 400.0, 800.0)
-"""Lengths of path over which drift is measured; KITTI's begin at 100 m, since cars go farther."""
+"""Path lengths over which drift is measured; KITTI's begin at 100 m, since cars go farther."""
 BUDGETS_MS = (50.0, 100.0)
-"""Time for a frame at 20 Hz and at 10 Hz."""
+"""Time available for a frame at 20 Hz and at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +30,12 @@ class Accuracy:
     """Errors against truth.
 
     Attributes:
-        errors: what `compare` found, ratios of the RMSE to the length of the true path, and `ate_after_start_m`: the
-            RMSE of the positions after START_S, aligned without those before; None if there are too few.
-        times_s, errors_m: (n,) position error of each pose after the alignment. walked_m: (n,) of true path until it.
+        errors: the results of `compare`, ratios of the RMSE to the length of the true path, and `ate_after_start_m`:
+            the RMSE of the positions after START_S, aligned without earlier ones; None if there are too few.
+        times_s, errors_m: (n,) position error of each pose after the alignment. walked_m: (n,) true path length up to
+            each pose.
         aligned: (n, 3) the estimate in the truth's world.
-        drift: by length of a piece of path, m: per cent of it by which each piece is wrong.
+        drift: by length of path pieces, m: the error of each piece in percent of this length.
     """
 
     errors: dict[str, Any]
@@ -50,9 +51,9 @@ class Outcome:
     """One variant, or another system's trajectory, on one recording.
 
     Attributes:
-        name: of the variant. missing: why there are no results, in words; "" if there are.
+        name: of the variant. missing: why there are no results, in words; "" if there are results.
         run: run.json; None for a trajectory from elsewhere. timings_ms: (n, stages and total).
-        accuracy: None without truth. unmeasured: why there is none although there is a truth.
+        accuracy: None without truth. unmeasured: why there is no accuracy although there is a truth.
     """
 
     name: str
@@ -68,7 +69,7 @@ class Outcome:
 
     @cached_property
     def results(self) -> dict[str, Any]:
-        """Its entry in results.json. Tables and findings read it by `value`."""
+        """The outcome's entry in results.json. Tables and findings read it by `value`."""
         run, scores = self.run or {}, self.ground or []
         return {
             "variant": self.name,
@@ -87,7 +88,7 @@ class Outcome:
         }
 
     def value(self, path: str) -> Any:
-        """An entry of `results`, such as `accuracy/ate_m/rmse`; None where it or what should hold it is missing."""
+        """An entry of `results`, such as `accuracy/ate_m/rmse`; None if any part of the path is missing."""
         tree: Any = self.results
         for name in path.split("/"):
             tree = tree.get(name) if tree else None
@@ -107,7 +108,7 @@ class Outcome:
 
     @property
     def staged(self) -> bool:
-        """Whether the stages of a frame were timed: of this engine, not of a baseline."""
+        """Whether the stages of a frame were timed, as for this engine but not for a baseline."""
         return self.run is not None and not self.run.get("baseline")
 
     @property
@@ -121,11 +122,11 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Evaluated:
-    """One recording with all that was run on it.
+    """One recording with the outcomes of all its runs.
 
     Attributes:
-        truth: what it is, in words; "" without one. notes: what was assumed about it.
-        truth_path: (n, 3) m, of the poses that were compared.
+        truth: its description; "" without one. notes: what was assumed about it.
+        truth_path: (n, 3) m, true positions of the compared poses.
     """
 
     name: str
@@ -138,7 +139,7 @@ class Evaluated:
 
 
 def load(job: Job, meaning: str) -> Outcome:
-    """The files of a finished job."""
+    """Read the files of a finished job."""
     run = finished(job)
     assert run is not None
     columns = range(2, len(TIMINGS) + 3)
@@ -165,7 +166,7 @@ def _trajectory(path: Path) -> Trajectory | None:
 
 
 def measure(outcomes: list[Outcome], truth: TruePoses | None) -> tuple[list[Outcome], Matched | None, str]:
-    """The outcomes with their errors; the truth as matched to the first of them; why none could be matched."""
+    """The outcomes with their errors; the truth as matched to the first outcome; why none could be matched."""
     if truth is None:
         return outcomes, None, ""
     first: Matched | None = None

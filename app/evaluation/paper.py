@@ -18,7 +18,7 @@ class Sequence:
     runtime_ms: dict[str, float]
 
     def ratios(self, errors: dict[str, float]) -> dict[str, float]:
-        """Errors over the length of the path, as Table 2 has them."""
+        """Errors divided by the path length, as in Table 2."""
         return {name: error / self.length_m for name, error in errors.items()}
 
 
@@ -51,7 +51,7 @@ SEQUENCES: dict[str, Sequence] = {
     )
     for name, (frames, duration_s, length_m, fast_lio, ours) in _TABLES_1_AND_3.items()
 }
-"""By the name of our simulated twin."""
+"""By the name of the simulated twin."""
 
 NOT_COMPARABLE = (
     "The paper ran LOAM, LIOM and FAST-LIO on real recordings, on an Intel i7-8565U. Ours are simulated twins with the"

@@ -1,4 +1,4 @@
-"""The residuals of a calibration, and a georeference, each as one SVG file."""
+"""Plots of the residuals of a calibration and of a georeference, each as one SVG file."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -8,7 +8,7 @@ import numpy as np
 from app.evaluation.figures import PALETTE, Line, chart
 from app.slam.types import F64
 
-if TYPE_CHECKING:  # who draws one needs nothing of the other
+if TYPE_CHECKING:  # each plot needs only its own package
     from app.calibration.calibrate import Calibration
     from app.georeference.align import Alignment
 
@@ -22,8 +22,7 @@ _STYLE = (
 
 
 def residual_plot(calibration: "Calibration") -> str:
-    """How much the LiDAR's turns and ways differ from the IMU's, and how far the points of each scan line are from
-    planes."""
+    """Differences between LiDAR and IMU in rotation and motion; distances of each scan line's points from planes."""
     turned, moved, lines = calibration.turned, calibration.moved, calibration.lines
     turns = np.linalg.norm(np.degrees([turned.before, turned.after]), axis=2)
     ways = np.linalg.norm(np.multiply([moved.before, moved.after], 1e3), axis=2)
@@ -39,7 +38,7 @@ def residual_plot(calibration: "Calibration") -> str:
 
 
 def georeference_plot(alignment: "Alignment", positions: F64) -> str:
-    """Two charts, in metres from the map's origin: east against north, and the residual of each fix.
+    """Two charts in metres: east and north from the map's origin, and the residual of each fix.
 
     Args:
         positions: (n, 3) m of the walked path in the map.
@@ -66,7 +65,7 @@ def georeference_plot(alignment: "Alignment", positions: F64) -> str:
 
 
 def _page(charts: Sequence[str]) -> str:
-    """Charts of the usual height below one another, as a file of their own."""
+    """One file with charts of the usual height below one another."""
     placed = [
         str(svg).replace("<svg ", f'<svg y="{_HEIGHT * k}" width="560" height="{_HEIGHT}" ', 1)
         for k, svg in enumerate(charts)

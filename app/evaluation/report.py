@@ -1,4 +1,4 @@
-"""Write what was measured: report.html, report.md, results.json, and the tables as CSV and LaTeX."""
+"""Write the results: report.html, report.md, results.json, and the tables as CSV and LaTeX."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence
@@ -111,12 +111,12 @@ def _leaves(entry: Any, path: str = "") -> Iterable[tuple[str, Any]]:
 
 
 def _machines(recordings: Sequence[Evaluated]) -> list[str]:
-    """Each machine and version that runs were made with, and which runs if there are several."""
+    """Each machine and version used, with the names of its runs if there are several."""
     return [f"{text}{_of(who)}" for text, who in _by_text(recordings, _machine)]
 
 
 def _parameters(recordings: Sequence[Evaluated]) -> list[tuple[str, str]]:
-    """Every parameter of this engine's runs by its dotted name; where they differ, each value with whose it is."""
+    """Every parameter of this engine's runs by dotted name; if runs differ, each value with the names of its runs."""
     found = []
     for leaf in leaves():
 
@@ -141,7 +141,7 @@ def _machine(run: dict[str, Any]) -> str:
 def _by_text(
     recordings: Sequence[Evaluated], of: Callable[[dict[str, Any]], str], *, of_engine: bool = False
 ) -> list[tuple[str, str]]:
-    """What `of` gives for the runs, each text once, with the names of its runs; "" if all have the same."""
+    """The texts that `of` returns for the runs, each once, with the names of its runs; "" if all are the same."""
     outcomes = [(r.name, outcome) for r in recordings for outcome in r.outcomes if outcome.staged or not of_engine]
     runs = {(name, outcome.name): of(outcome.run) for name, outcome in outcomes if outcome.run}
     texts = dict.fromkeys(runs.values())
@@ -151,7 +151,7 @@ def _by_text(
 
 
 def _names(chosen: Sequence[_Who], every: Sequence[_Who]) -> str:
-    """Runs by variant or by recording alone, where that says it all."""
+    """Names of runs by variant or by recording alone, if that is unambiguous."""
     for part in (1, 0):
         names = dict.fromkeys(who[part] for who in chosen)
         if sum(who[part] in names for who in every) == len(chosen):

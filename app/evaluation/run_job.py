@@ -1,4 +1,4 @@
-"""Runs a job, with the engine or a baseline, and writes the files that it leaves."""
+"""Runs a job with the engine or a baseline, and writes its files."""
 
 import json
 import os
@@ -60,7 +60,7 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
                 _score_ground(ground, result, marks)
             progress(session.frame + 1, info.frames or 0)
         if session.loops:
-            session.loops.poll()  # those of the last keyframes
+            session.loops.poll()  # the loops of the last keyframes
         log, frame, keyframes = session.log, session.map_frame, session.engine.keyframes
         poses = frame.poses(np.array([keyframe.T_odom_imu for keyframe in keyframes]).reshape(-1, 4, 4))
         times = np.column_stack([log.timings_ms, cpu_ms])
@@ -78,9 +78,9 @@ def run_job(job: Job, progress: Callable[[int, int], None]) -> None:
 
 
 def run_baseline(job: Job, progress: Callable[[int, int], None]) -> None:
-    """Another system on the same measurements. Its clouds are undistorted by its own poses, for the map.
+    """Run another system on the same measurements. For the map, its clouds are undistorted with its own poses.
 
-    Where it gives no finite pose, its last one stands, and the frame counts as lost.
+    If it returns no finite pose, its last pose is used, and the frame counts as lost.
     """
     system = find_system(job.baseline).start(job.params)
     feed, keyframes = FileFeed(job.recording, job.params, *job.read), KeyframeStore()
@@ -111,7 +111,7 @@ def run_baseline(job: Job, progress: Callable[[int, int], None]) -> None:
 
 
 def _common(job: Job) -> dict[str, Any]:
-    """What run.json holds of any run."""
+    """The entries of run.json that every run has."""
     return {
         "key": job.key,
         "hemislam": __version__,
@@ -130,7 +130,7 @@ def _common(job: Job) -> dict[str, Any]:
 
 
 def _loop_drift(session: Session) -> float | None:
-    """Median distance between where odometry and where accepted loops have their newer keyframes, m."""
+    """Median distance (m) between the newer keyframes of accepted loops and where odometry places them."""
     if session.loops is None:
         return None
     poses = [keyframe.T_odom_imu for keyframe in session.engine.keyframes]
@@ -148,7 +148,7 @@ def _write(
     """Cut off the lead, measure the map, and write all files.
 
     Args:
-        whole: of all that was read. times: (n, stages, total and CPU), ms. poses: of the keyframes.
+        whole: including the lead. times: (n, stages, total and CPU), ms. poses: of the keyframes.
 
     Raises:
         HemislamError: the recording ends before the part begins.
@@ -174,11 +174,11 @@ def _write(
     pieces = {place: crops.crop(part_of_map(), poses, centre) for place, centre in centres.items()}
     np.savez_compressed(job.folder / "crops.npz", allow_pickle=False, **pieces)
     text = json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
-    (job.folder / "run.json").write_text(text, encoding="utf-8", errors="backslashreplace")  # a path need not be UTF-8
+    (job.folder / "run.json").write_text(text, encoding="utf-8", errors="backslashreplace")  # paths need not be UTF-8
 
 
 def _score_ground(scores: list[GroundScore], result: StepResult, marks: dict[int, bytes]) -> None:
-    """Add a frame's score, over all its points or, if there are marks, over those that are marked."""
+    """Add a frame's score over all its points or, if there are marks, over the marked points."""
     cloud, truth = result.cloud, result.truth_ground
     if marks:
         truth = np.frombuffer(marks.get(result.stamp_ns, b""), np.uint8)

@@ -1,6 +1,6 @@
-"""Runs jobs side by side, each in a process of its own, with a progress bar for each and one for all.
+"""Runs jobs in parallel, each in a process of its own, with a progress bar for each and one for all.
 
-With a process for each job, its peak memory is its own, and a crash costs one column only.
+With a process per job, the peak memory is that of the job alone, and a crash costs only one column.
 """
 
 import threading
@@ -17,11 +17,11 @@ from app.evaluation.run_job import run_job
 from app.slam.errors import HemislamError
 
 REPORT_EVERY_S = 0.2
-tqdm.set_lock(threading.RLock())  # its own is a semaphore of processes, which stays where this one is killed
+tqdm.set_lock(threading.RLock())  # the default, a semaphore, would outlive a kill
 
 
 RunJobs = Callable[[list[Job]], dict[tuple[str, str], str]]
-"""Runs jobs, on this machine or on a cluster."""
+"""Runs jobs on this machine or on a cluster."""
 
 
 def run_jobs(
@@ -34,10 +34,10 @@ def run_jobs(
     """Run all jobs that are not finished yet, `parallel` at a time.
 
     Args:
-        quiet: say nothing. ended: called for each that has ended, with whether it ran now or was finished before.
+        quiet: print nothing. ended: called for each job that has ended, with whether it ran now or had finished before.
 
     Returns:
-        Why jobs failed, by (recording, variant); those not named are finished.
+        Why jobs failed, by (recording, variant); all others are finished.
     """
     todo = [job for job in jobs if finished(job) is None]
     before = len(jobs) - len(todo)
@@ -48,7 +48,7 @@ def run_jobs(
     stop, errors = threading.Event(), dict[tuple[str, str], str]()
     every = tqdm(
         desc="All runs", total=len(jobs), initial=before, unit=" runs", smoothing=0, disable=quiet or None
-    )  # smoothing 0: the time left is by the mean of all runs
+    )  # smoothing 0: the time left is estimated from the mean of all runs
     with every, ThreadPoolExecutor(parallel) as pool:
         try:
             running = {pool.submit(_run, stop, quiet, job): job for job in todo}

@@ -32,7 +32,7 @@ class TableRow:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """`folded`: closed at first, on a page where that is possible."""
+    """`folded`: initially closed, on a page that can fold tables."""
 
     title: str
     columns: tuple[str, ...]
@@ -66,7 +66,7 @@ def make_tables(recordings: Sequence[Evaluated]) -> list[Table]:
 
 
 def accuracy(recordings: Sequence[Evaluated]) -> Table:
-    """As the paper's Table 2."""
+    """The indicators of the paper's Table 2."""
     indicators = [
         Indicator("ATE, RMSE (m)", "accuracy/ate_m/rmse", ".4f"),
         Indicator("ATE, mean (m)", "accuracy/ate_m/mean", ".4f"),
@@ -123,7 +123,7 @@ def all_errors(recordings: Sequence[Evaluated]) -> Table:
 
 
 def runtime(recordings: Sequence[Evaluated]) -> Table:
-    """As the paper's Table 3."""
+    """The indicators of the paper's Table 3."""
     indicators = [
         Indicator("median (ms)", "runtime_ms/total/median", ".2f", like=LIKE_IN_TIME),
         Indicator("95 % (ms)", "runtime_ms/total/p95", ".2f", like=LIKE_IN_TIME),
@@ -195,7 +195,7 @@ def ground(recordings: Sequence[Evaluated]) -> Table:
 
 
 def beside_paper(recordings: Sequence[Evaluated]) -> Table:
-    """Ours and the paper's own, for the simulated twins of its sequences."""
+    """Our values beside the paper's, for the simulated twins of its sequences."""
     names = paper.SYSTEMS
     rows: list[TableRow] = []
     for recording in recordings:
@@ -216,7 +216,7 @@ def beside_paper(recordings: Sequence[Evaluated]) -> Table:
 
 
 def _names(recordings: Iterable[Evaluated], *, run: bool = False) -> tuple[str, ...]:
-    """Names of all outcomes in order of appearance; with `run` only those of this engine."""
+    """Names of all outcomes in order of appearance; with `run`, without trajectories from elsewhere."""
     outcomes = [outcome for recording in recordings for outcome in recording.outcomes]
     return tuple(dict.fromkeys(o.name for o in outcomes if not run or o.run is not None or o.missing))
 
@@ -239,7 +239,7 @@ def _rows(recordings: Iterable[Evaluated], names: Sequence[str], indicators: Seq
 
 
 def _row(group: str, indicator: Indicator, values: Sequence[Number]) -> TableRow:
-    """Formatted values. Those like the smallest are the best, unless all are."""
+    """A row of formatted values. Values about equal to the smallest are marked best, unless all values are."""
     cells = tuple("–" if value is None else format(value, indicator.form) for value in values)
     numbers = [value for value in values if value is not None]
     most = min(numbers) + indicator.like * abs(min(numbers)) if indicator.ranked and numbers else -np.inf

@@ -16,7 +16,7 @@ from app.slam.types import F64, I64
 from app.slam.user_text import as_numbers, read_rows
 
 JUMP_M, JUMP_M_S, JUMP_TIMES = 1.0, 15.0, 5.0
-"""A step over both limits that is this many times faster than its neighbours is a jump of the frame, not motion."""
+"""A step beyond both limits, and this many times faster than its neighbours, is a jump of the frame, not motion."""
 GNSS_COLUMNS = 13
 H2LID_LEVER = (-0.034, -0.283, 0.342)
 """m from the IMU to the GNSS antenna; x right, y forward, z up (README of the data set)."""
@@ -35,14 +35,14 @@ TYPES = (*_POSES, NAVSAT)
 
 @dataclass(frozen=True, slots=True)
 class TruePoses:
-    """True poses as they were read.
+    """True poses as read from a file or topic.
 
     Attributes:
-        source: file or topic. kind: what it is, in words.
+        source: file or topic. kind: a description.
         stamps_ns: (n,) strictly increasing; None: one pose for each frame of the recording.
         positions: (n, 3) m of the truth's point. quaternions: (n, 4) x y z w, T_world_body; None if unknown.
-        own_clock: its stamps are not in the recording's clock.
-        own_axes: the body's axes differ from the IMU's by a constant, unknown rotation.
+        own_clock: whether its stamps are in a clock other than the recording's.
+        own_axes: whether the body's axes differ from the IMU's by a constant, unknown rotation.
         lever: (3,) m from the IMU to the truth's point, in the body's axes.
     """
 
@@ -95,7 +95,7 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
     """Read a file, or `topic:/name` in the recording; `lever` replaces the lever arm that the format implies.
 
     Raises:
-        HemislamError: it cannot be read, is not what it should be, or jumps; or the lever arm is not finite.
+        HemislamError: it cannot be read, has the wrong format, or jumps; or the lever arm is not finite.
     """
     if text.startswith("topic:"):
         if recording is None:
@@ -114,7 +114,7 @@ def read_truth(text: str, recording: Path | None = None, lever: tuple[float, flo
 
 
 def check_poses(path: Path) -> None:
-    """Raises HemislamError as `read_truth` if this is no TUM file of poses that can be true."""
+    """Raises HemislamError like `read_truth` if this is not a TUM file with plausible poses."""
     check(_tum(path))
 
 
@@ -122,7 +122,7 @@ def _read_file(path: Path) -> TruePoses:
     """Read a truth file. Its number of columns determines its format.
 
     Raises:
-        HemislamError: it cannot be read, or is none of the formats, or holds NaN.
+        HemislamError: it cannot be read, has none of the formats, or holds NaN.
     """
     rows = read_rows(path, _FORMATS)
     if rows and rows[0][1][0].lower().startswith("gpstime"):
@@ -161,7 +161,7 @@ def _kitti(path: Path, table: F64) -> TruePoses:
             stamps = _times(beside, len(poses))
             break
     quaternions = Rotation.from_matrix(rotations).as_quat()
-    # Times that count from zero are not a date: the clock is the truth's own.
+    # Times that count from zero are not dates: the truth has its own clock.
     own = stamps is not None and bool(stamps[0] < 1e17)
     return TruePoses(f"The truth {path}", "KITTI", stamps, poses[:, :, 3].copy(), quaternions, own_clock=own)
 
@@ -241,7 +241,7 @@ def _pose(pose: Any) -> list[float]:
 
 
 def _east_north_up(fixes: F64) -> F64:
-    """Geodetic (n, 3) degrees, degrees, m on WGS84 to metres east, north, up of the first."""
+    """Convert geodetic (n, 3) degrees, degrees, m on WGS84 to metres east, north, up from the first position."""
     latitude, longitude, height = fixes[0].tolist()
     local = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r}"
     import pyproj

@@ -1,6 +1,6 @@
-"""True poses brought into the clock, point and axes of the IMU.
+"""Transform true poses to the clock, point and axes of the IMU.
 
-What had to be assumed or estimated for that is returned in words, for the report.
+Everything that had to be assumed or estimated for this is returned in words, for the report.
 """
 
 from dataclasses import dataclass, replace
@@ -15,17 +15,17 @@ from app.slam.trajectory import Trajectory
 from app.slam.types import F64, I64
 
 ODD_AXES_DEG = 10.0
-"""Orientations that differ from ours by a constant angle over this may be in other axes."""
+"""Orientations that differ from ours by a constant angle above this may be in other axes."""
 GRID_S = 0.05
 FINE_S = 0.001
 MIN_OVERLAP_S = 10.0
 MIN_CORRELATION = 0.6
-"""Grid of the first and of the second search for an offset, and what both need."""
+"""Grids of the first and of the second search for an offset, and the least overlap and correlation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """Truth beside an estimate: T_world_imu in the recording's clock.
+    """The truth for an estimate: T_world_imu in the recording's clock.
 
     Attributes:
         has_rotation: whether the orientations are the truth's own, in known axes. If not, they are those of the
@@ -40,10 +40,10 @@ class Matched:
 
 
 def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None) -> Matched:
-    """Bring the truth into the clock, point and axes of the estimate.
+    """Transform the truth to the clock, point and axes of the estimate.
 
     Args:
-        offset_s: time to add to the truth's stamps if its clock is its own; None: find it.
+        offset_s: time to add to the truth's stamps if it has its own clock; None: find it.
 
     Raises:
         HemislamError: the two have no time or no motion in common.
@@ -89,7 +89,7 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
 
 
 def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
-    """The truth with the orientations of the estimate, in the world of the truth, where both overlap in time."""
+    """The truth with the orientations of the estimate, in the world of the truth, over their common time."""
     inside = (there.stamps_ns >= estimate.stamps_ns[0]) & (there.stamps_ns <= estimate.stamps_ns[-1])
     there = there.chosen(inside)
     if len(there) < 3:
@@ -103,7 +103,7 @@ def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
 
 
 def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) -> tuple[Trajectory, bool, str]:
-    """The truth in the IMU's axes, by the mean rotation between both, if its axes `certainly` differ.
+    """The truth in the IMU's axes, using the mean rotation between both, if its axes `certainly` differ.
 
     Also returns whether the orientations are still the truth's own, and a note for the report.
     """
@@ -140,15 +140,16 @@ def _vector(values: F64) -> str:
 
 # --- the offset between two clocks ----------------------------------------------------------------
 def find_offset(estimate: Trajectory, truth: Trajectory, *, by_rotation: bool) -> tuple[float, float]:
-    """Compare the angular speed (or, without orientations, the speed), which does not depend on the axes.
+    """Find the clock offset from the angular speeds (or, without orientations, speeds), which do not depend on axes.
 
-    First over all offsets at which both overlap for at least half of the shorter one, then around the best to FINE_S.
+    The first search covers all offsets at which both overlap for at least half of the shorter one; the second refines
+    the best offset to FINE_S.
 
     Returns:
-        s to add to the truth's stamps, and the correlation of both motions then, up to 1.
+        s to add to the truth's stamps, and the correlation of both motions at this offset, up to 1.
 
     Raises:
-        HemislamError: they are too short, or similar at no offset.
+        HemislamError: they are too short, or not similar at any offset.
     """
     window_s = 0.2 if by_rotation else 1.0
     spans = [(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in (estimate, truth)]

@@ -1,4 +1,4 @@
-"""Variants: what is run on the same recording. Sets of parameters such as the paper's ablation, and other systems."""
+"""Variants that run on the same recording: sets of parameters, such as the paper's ablation, and other systems."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ LOOPS = "loops.enabled"
 class Variant:
     """Attributes:
     name: column of the tables. values: parameters by dotted name that replace those of the recording.
-    meaning: in words. baseline: name of the system that is run in place of the engine; "" for the engine.
+    meaning: in words. baseline: name of the system that replaces the engine; "" for the engine.
     """
 
     name: str
@@ -50,7 +50,7 @@ def parse_variant(text: str) -> Variant:
     """A variant from `NAME:section.name=value,section.name=value`. Values are YAML; lists in brackets may hold commas.
 
     Raises:
-        HemislamError: the text is not written like that.
+        HemislamError: the text does not have this form.
     """
     name, colon, rest = (part.strip() for part in text.partition(":"))
     example = "--variant NAME:ground.sigma=0.03,ground.alpha=30"
@@ -63,20 +63,20 @@ def parse_variant(text: str) -> Variant:
 
 
 def baseline_variant(name: str) -> Variant:
-    """Another system as a variant.
+    """A variant that runs another system.
 
     Raises:
-        HemislamError: there is none of this name, or it is not installed.
+        HemislamError: there is no system of this name, or it is not installed.
     """
     system = find_system(name)
     return Variant(system.title, {}, ", version ".join(filter(None, (system.meaning, system.version()))), baseline=name)
 
 
 def choose_variants(own: list[Variant], *, ablation: bool, baselines: Sequence[str] = ()) -> list[Variant]:
-    """The other systems, the paper's ablation, if wanted, and the user's: columns as in the paper's Table 2.
+    """The other systems, the paper's ablation (if wanted) and the user's variants: columns as in the paper's Table 2.
 
     Raises:
-        HemislamError: two have the same name, or there is none.
+        HemislamError: two variants have the same name, or there is no variant.
     """
     chosen = [*map(baseline_variant, baselines), *(PAPER if ablation else ()), *own]
     names = [variant.name for variant in chosen]
