@@ -62,13 +62,13 @@ def export(
       kitti       trajectory.kitti         poses as rows of 12 numbers
       csv         trajectory.csv           poses with easting, northing, height if known
       gpx         trajectory.gpx           the walk as a GPX track
-      occupancy   occupancy.pgm, .yaml     free, wall, unknown for nav2
+      occupancy   occupancy.pgm, .yaml     occupancy grid for nav2: free, wall, unknown
       floor       floor.png, .pgw          floor plan: a slice 1 to 1.5 m above the ground
-      dxf         floor.dxf                the same as outlines
+      dxf         floor.dxf                the floor plan as outlines
       terrain     terrain.tif              height of the ground as GeoTIFF
       density     density.tif              points per square metre as GeoTIFF
       section     section.png, .svg, .dxf  the --box seen from its front
-      profile     profile.png, .svg, .dxf  the same along the walked path: chainage, height
+      profile     profile.png, .svg, .dxf  a slab along the walked path: chainage, height
       kmz         map.kmz                  walk, picture and keyframes for Google Earth
       html        share.html               the map in one page that needs no server
 

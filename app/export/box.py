@@ -1,4 +1,4 @@
-"""A box in the map, upright and turned about its middle: what is clipped, exported, or cut as a section."""
+"""An upright box in the map, rotated about its middle, for clipping, exports and sections."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -15,11 +15,11 @@ _FARTHEST_M: Final = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Its front is the side towards -y, before it is turned.
+    """A box in the map. Its front is the side that faces -y before the box is rotated.
 
     Attributes:
-        low, high: least and greatest x, y, z before it is turned, m, map.
-        turn: degrees about the vertical through its middle, anticlockwise from above.
+        low, high: least and greatest x, y, z before rotation, m, map.
+        turn: rotation about the vertical through its middle, degrees, anticlockwise from above.
 
     Raises:
         HemislamError: a value is not a number, out of range, or low is not below high.
@@ -37,7 +37,7 @@ class Box:
 
     @classmethod
     def around(cls, middle: npt.ArrayLike, size: npt.ArrayLike, turn: float = 0.0) -> "Box":
-        """By its middle and size, (3,) m each."""
+        """A box given by its middle and size, (3,) m each."""
         half = np.asarray(size, np.float64) / 2
         low, high = np.asarray(middle) - half, np.asarray(middle) + half
         return cls((low[0], low[1], low[2]), (high[0], high[1], high[2]), (turn + 180) % 360 - 180)
@@ -49,17 +49,17 @@ class Box:
 
     @property
     def size(self) -> F64:
-        """(3,) m, along its own axes."""
+        """(3,) m, size along the box's own axes."""
         return np.array(self.high) - self.low
 
     @property
     def axes(self) -> F64:
-        """(3, 3) its axes as columns, in the map."""
+        """(3, 3) the box's axes as columns, in the map."""
         c, s = np.cos(np.radians(self.turn)), np.sin(np.radians(self.turn))
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def own(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        """(n, 3) points of the map from the box's middle, along its axes; of the same precision."""
+        """(n, 3) points of the map relative to the box's middle, along its axes; same precision."""
         return (points - self.middle.astype(points.dtype)) @ self.axes.astype(points.dtype)
 
     def holds(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:

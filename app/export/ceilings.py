@@ -1,4 +1,4 @@
-"""Ceilings, which hide what is below them from someone who looks from above."""
+"""Ceilings, which hide everything below them in views from above."""
 
 from typing import Final
 
@@ -11,12 +11,12 @@ _CONE: Final = float(np.cos(np.radians(35.0)))
 _HIGHEST_M: Final = 8.0
 _LEAST_SHARE: Final = 0.004
 _FLATNESS_M: Final = 0.12
-"""Most median deviation of the points overhead from their median height: treetops are rougher."""
+"""Largest median deviation of a ceiling's points from their median height: treetops are rougher."""
 _MARGIN_M: Final = 0.25
 
 
 def below_ceiling(points: F32, labels: U8, up: F64) -> npt.NDArray[np.bool_]:
-    """Which points stay when the ceiling above a keyframe is hidden: all where nothing flat is overhead.
+    """Mask of the points that stay when the ceiling above a keyframe is hidden: all points if there is none.
 
     Points labelled ground always stay: a ceiling mistaken for ground must be visible.
 

@@ -17,7 +17,7 @@ from app.georeference.tables import GPS_MINUS_UNIX_S
 
 
 def write(path: Path, results: Results) -> None:
-    """Poses are in the map or, if it is known, in the coordinate system on Earth. Each file has new GUIDs."""
+    """Write the map; poses are in the coordinate system on Earth if known, else in the map. Each file has new GUIDs."""
     try:
         file = _Writer(str(path), results.where)
         try:
@@ -31,14 +31,14 @@ def write(path: Path, results: Results) -> None:
 
 
 class _Writer(pye57.E57):  # type: ignore[misc] # it has no types
-    """pye57 leaves the coordinate system empty, and no node can be set twice."""
+    """Sets the coordinate system, which pye57 leaves empty; nodes cannot be set twice."""
 
     def __init__(self, path: str, where: GeoReference | None) -> None:
         self._wkt = "" if where is None else where.wkt1()
         super().__init__(path, "w")
 
     def close(self) -> None:
-        """Once only: after the disk has failed, closing again on deletion would print a second error."""
+        """Close only once: after a disk failure, closing again on deletion would print a second error."""
         if (image_file := self.__dict__.pop("image_file", None)) is not None:
             image_file.close()
 

@@ -1,4 +1,4 @@
-"""What a session leaves behind: one folder of result files. `EXPORTS` declares them.
+"""The result files of a session, in one folder. `EXPORTS` declares them.
 
 `save_results` writes them from the frames of a session, at any moment.
 """
@@ -38,11 +38,11 @@ class Export:
     """One result file.
 
     Attributes:
-        name: of the file. meaning: what it holds, for help texts and the documentation.
+        name: of the file. meaning: its content, for help texts and the documentation.
         write: writes it to a path.
-        format: what `hemislam export --format` calls it; "" if it only belongs to a run.
-        by_run: whether every run writes it. of_loops: exists only if loops were searched.
-        extra: what has to be installed beside hemislam for it. on_earth: whether it needs a georeference.
+        format: its name in `hemislam export --format`; "" if it only belongs to a run.
+        by_run: whether every run writes it. of_loops: whether it exists only if loops were searched.
+        extra: the extra of the package that it needs. on_earth: whether it needs a georeference.
     """
 
     name: str
@@ -56,18 +56,18 @@ class Export:
 
 
 def _later(module: str, function: str) -> Callable[[Path, Results], object]:
-    """A writer of a module that is imported when it is needed."""
+    """A writer from a module that is imported only when needed."""
     return lambda path, results: getattr(importlib.import_module(f"app.export.{module}"), function)(path, results)
 
 
 def _wanted(format: str, name: str, meaning: str, writer: str, extra: str = "", *, on_earth: bool = False) -> Export:
-    """A file that is written only if it is asked for, by `module.function`."""
+    """A file that is written only on request, by `module.function`."""
     return Export(name, meaning, _later(*writer.split(".")), format, by_run=False, extra=extra, on_earth=on_earth)
 
 
 def _drawn(kind: str, suffix: str) -> Export:
-    """A section of the box or a profile of the walk as one kind of drawing."""
-    meaning = "what is in the box, from its front" if kind == "section" else "along the walk: chainage and height"
+    """A section of the box, or a profile of the walk, in one drawing format."""
+    meaning = "the box, seen from its front" if kind == "section" else "along the walk: chainage and height"
 
     def write(path: Path, results: Results) -> None:
         files = importlib.import_module("app.export.section_files")
@@ -103,7 +103,7 @@ def _write_report(path: Path, results: Results) -> None:
         made["accuracy_odometry"] = report.accuracy(results.log.odometry, info)
     results.report = report.finite(made)
     text = json.dumps(results.report, indent=2, ensure_ascii=False) + "\n"
-    path.write_text(text, encoding="utf-8", errors="backslashreplace")  # of a path that is no UTF-8
+    path.write_text(text, encoding="utf-8", errors="backslashreplace")  # the path may not be UTF-8
 
 
 EXPORTS = (
@@ -131,24 +131,24 @@ EXPORTS = (
     Export("map.ply", "the map: x y z intensity ground moving ring time; keyframes", _write_map, format="ply"),
     Export("report.json", "parameters, frame counts, ground share, errors against the truth", _write_report),
     _wanted("las", "map.las", "the map as LAS 1.4: time, intensity, ring, ground, moving", "las.write_las"),
-    _wanted("laz", "map.laz", "the same, compressed", "las.write_laz"),
+    _wanted("laz", "map.laz", "the map as LAZ: compressed LAS", "las.write_laz"),
     _wanted("e57", "map.e57", "the map as E57: one scan with its pose per keyframe", "e57.write", "e57"),
     _wanted("pcd", "map.pcd", "the map as PCD: intensity ring ground moving time", "map_file.write_pcd"),
     _wanted("kitti", "trajectory.kitti", "poses as rows of 12 numbers, without stamps", "paths.write_kitti"),
     _wanted("csv", "trajectory.csv", "poses with easting, northing, height if known", "paths.write_csv"),
     _wanted("gpx", "trajectory.gpx", "the walk as a GPX track", "paths.write_gpx", on_earth=True),
-    _wanted("occupancy", "occupancy.pgm", "free, wall, unknown for nav2", "plan.write_pgm", "plan"),
-    _wanted("occupancy", "occupancy.yaml", "where that lies in the map", "plan.write_yaml", "plan"),
+    _wanted("occupancy", "occupancy.pgm", "occupancy grid for nav2: free, wall, unknown", "plan.write_pgm", "plan"),
+    _wanted("occupancy", "occupancy.yaml", "position of the grid in the map", "plan.write_yaml", "plan"),
     _wanted("floor", "floor.png", "floor plan: a slice 1 to 1.5 m above the ground", "plan.write_floor_png", "plan"),
-    _wanted("floor", "floor.pgw", "where that lies, as a world file", "plan.write_world_file", "plan"),
-    _wanted("dxf", "floor.dxf", "the same as outlines", "plan.write_dxf", "plan"),
+    _wanted("floor", "floor.pgw", "position of the floor plan, as a world file", "plan.write_world_file", "plan"),
+    _wanted("dxf", "floor.dxf", "the floor plan as outlines", "plan.write_dxf", "plan"),
     _wanted("terrain", "terrain.tif", "height of the ground as GeoTIFF", "plan.write_terrain", "plan"),
     _wanted("density", "density.tif", "points per square metre as GeoTIFF", "plan.write_density", "plan"),
     *(_drawn(kind, suffix) for kind in ("section", "profile") for suffix in ("png", "svg", "dxf")),
     _wanted("kmz", "map.kmz", "walk, picture and keyframes for Google Earth", "google_earth.write", on_earth=True),
     _wanted("html", "share.html", "the map in one page that needs no server", "share.write"),
 )
-"""All result files, in the order in which they are written. report.json is the last of a run: it counts the points."""
+"""All result files, in writing order. report.json is the last file of a run, because it counts the points."""
 BY_RUN = tuple(export for export in EXPORTS if export.by_run)
 FORMATS = tuple(dict.fromkeys(export.format for export in EXPORTS if export.format))
 
@@ -157,7 +157,7 @@ def of_formats(formats: Sequence[str]) -> tuple[Export, ...]:
     """The exports of these formats, in their order.
 
     Raises:
-        HemislamError: there is no such format, or what it needs is not installed.
+        HemislamError: there is no such format, or a package that it needs is not installed.
     """
     if unknown := sorted(set(formats) - set(FORMATS)):
         raise HemislamError(f"There is no format {unknown[0]}; choose from {', '.join(FORMATS)}.")
@@ -170,7 +170,7 @@ def of_formats(formats: Sequence[str]) -> tuple[Export, ...]:
 
 @contextlib.contextmanager
 def results_folder(folder: Path, *, replace: bool = False) -> Iterator[None]:
-    """While results are made for a folder, which is created; if there are none in the end, it is removed again.
+    """Create a folder for the results made in this context; if it is empty at the end, remove it.
 
     Raises:
         HemislamError: the folder holds results and `replace` is not set, or it is not writable.
@@ -187,7 +187,7 @@ def results_folder(folder: Path, *, replace: bool = False) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # one holds something
+        with contextlib.suppress(OSError):  # a folder is not empty
             for made in new:
                 made.rmdir()
 
@@ -207,7 +207,7 @@ def save_results(
 
 
 def _write_results(folder: Path, results: Results, exports: Sequence[Export]) -> dict[str, Any]:
-    """As `save_results`, into a folder that is there."""
+    """As `save_results`, into an existing folder."""
     written = [export for export in exports if results.loops or not export.of_loops]
     if not written:
         raise HemislamError(f"There is no {exports[0].name}, because the loop search is off; set loops.enabled.")
@@ -243,7 +243,7 @@ def _write_results(folder: Path, results: Results, exports: Sequence[Export]) ->
 
 
 def _progress_of(file: int, files: int, show: Callable[[float], None]) -> Callable[[float], None]:
-    """Progress over all files. It never goes back, although some files read the points several times."""
+    """Progress over all files. It never decreases, although some files read the points several times."""
     most = 0.0
 
     def tell(share: float) -> None:

@@ -1,4 +1,4 @@
-"""A folder of results, read again to export it in other formats."""
+"""Reads a folder of results, to export it in other formats."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ from app.slam.trajectory import read_tum
 
 
 def read_results(folder: Path) -> Results:
-    """What exports are made from. The trajectory is that of the map, loops included.
+    """Read the results for exports. The trajectory is that of the map, with loops.
 
     A georeference that cannot be used is left out, and `Results.problem` says why.
 
@@ -43,7 +43,7 @@ def read_results(folder: Path) -> Results:
 
 
 def recording_of(folder: Path) -> Path | None:
-    """The recording that the results in a folder were made of; None if they have no report.json that names it."""
+    """The recording from which the results in a folder were made; None if no report.json names it."""
     try:
         return Path(json.loads((folder / "report.json").read_bytes())["recording"]["path"])
     except (OSError, ValueError, KeyError, TypeError):

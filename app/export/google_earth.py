@@ -15,11 +15,11 @@ from app.export.results import Results
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 GROUND, REST = (150, 190, 220), (255, 140, 40)
-"""Colours of cells with nothing but ground, and of all others."""
+"""Colours of cells that contain only ground, and of all other cells."""
 
 
 def write(path: Path, results: Results) -> None:
-    """Heights lie on Google Earth's ground, since its own heights are not those of a survey."""
+    """Everything is placed on Google Earth's ground, since its heights do not match those of a survey."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
     ElementTree.register_namespace("", KML)
     ElementTree.register_namespace("gx", GX)
@@ -77,7 +77,7 @@ def _places(results: Results, points: Any) -> str:
 
 
 def _corners(results: Results, raster: Raster) -> str:
-    """Of the picture, anticlockwise from the lower left."""
+    """Corners of the picture, anticlockwise from the lower left."""
     assert results.where is not None
     rows, columns = raster.points.shape
     east, north = raster.cell * columns, raster.cell * rows
@@ -86,7 +86,7 @@ def _corners(results: Results, raster: Raster) -> str:
 
 
 def _picture(raster: Raster) -> np.ndarray:
-    """(rows, columns, 4) uint8, transparent where nothing was seen, more opaque where there are more points."""
+    """(rows, columns, 4) uint8, transparent where nothing was seen, and more opaque where there are more points."""
     rgba = np.zeros((*raster.points.shape, 4), np.uint8)
     rgba[..., :3] = np.where((raster.points > raster.ground)[..., None], REST, GROUND)
     often = np.log1p(raster.points / max(1.0, float(np.median(raster.points[raster.points > 0]))))

@@ -19,22 +19,22 @@ from app.slam.types import F64, MOVING
 SCALE = 0.001
 """m."""
 BATCH = 1_000_000
-"""Points that are compressed at once: lazrs gives each core chunks of 50,000."""
+"""Points compressed at once: lazrs gives each core chunks of 50,000."""
 OTHER, GROUND_CLASS, MOVING_CLASS = 1, 2, 18
-"""18 is "high noise": viewers and filters can leave it out by its class."""
+"""Class 18 is "high noise", which viewers and filters can leave out."""
 CLASSES = np.array([OTHER, GROUND_CLASS, GROUND_CLASS, MOVING_CLASS], np.uint8)
-"""By label."""
+"""Class by label."""
 ADJUSTED_S = GPS_MINUS_UNIX_S - 1_000_000_000
-"""From Unix time to "adjusted standard GPS time"."""
+"""Offset from Unix time to "adjusted standard GPS time"."""
 
 
 def write_las(path: Path, results: Results) -> None:
-    """Uncompressed."""
+    """Write the map uncompressed."""
     _write(path, results, compressed=False)
 
 
 def write_laz(path: Path, results: Results) -> None:
-    """Compressed by lazrs on all cores."""
+    """Write the map, compressed by lazrs on all cores."""
     _write(path, results, compressed=True)
 
 
@@ -79,7 +79,7 @@ def _record(block: Block, header: laspy.LasHeader, where: GeoReference | None) -
     array: np.ndarray = laspy.PackedPointRecord.zeros(len(block), header.point_format).array
     array["X"], array["Y"], array["Z"] = np.rint((points - header.offsets) / SCALE).T
     array["intensity"] = np.clip(np.rint(block.intensity), 0, 65535)
-    array["bit_fields"] = 0x11  # the only return of its pulse
+    array["bit_fields"] = 0x11  # each point is the only return of its pulse
     array["classification"] = CLASSES[np.minimum(block.labels, MOVING)]
     array["user_data"] = np.minimum(block.ring, 255)
     array["point_source_id"] = block.keyframe % 65536

@@ -1,6 +1,6 @@
 """The map as PLY, and as PCD 0.7 for the Point Cloud Library.
 
-After its points the PLY holds the keyframes, so that other formats can be made of it later.
+After its points, the PLY holds the keyframes, so that it can be exported to other formats later.
 """
 
 import os
@@ -28,12 +28,12 @@ VERTEX = np.dtype(
         ("time", "<f8"),
     ]
 )
-"""m in the map; seconds as in the trajectory."""
+"""Positions in m, in the map; time in s, as in the trajectory."""
 KEYFRAME = np.dtype(
     [("points", "<i4"), ("seconds", "<i4"), ("nanoseconds", "<i4")]
     + [(name, "<f8") for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 )
-"""How many of the points are its own, the end of its scan, and T_map_lidar."""
+"""Number of the keyframe's points, time of its scan's end, and T_map_lidar."""
 PCD_POINT = np.dtype(
     [(name, VERTEX[name]) for name in ("x", "y", "z", "intensity", "ring", "ground", "moving", "time")]
 )
@@ -41,8 +41,10 @@ COMMENT = "hemislam map, metres, z up"
 
 
 def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
-    """Write points and keyframes. Returns how many points there are, which enters the header at the end, and how many
-    of them are on what moves.
+    """Write points and keyframes; the number of points is put into the header at the end.
+
+    Returns:
+        Numbers of all points, and of those on moving objects.
     """
     keyframes, count, moving = [], 0, 0
     with path.open("wb") as file:
@@ -61,7 +63,7 @@ def write(path: Path, blocks: Iterable[Block]) -> tuple[int, int]:
 
 
 def write_pcd(path: Path, results: Results) -> None:
-    """Points alone. Their number enters the header at the end, too."""
+    """Write only the points; their number is put into the header at the end."""
     count = 0
     with path.open("wb") as file:
         file.write(pcd_header(PCD_POINT, 0, COMMENT))
@@ -73,7 +75,7 @@ def write_pcd(path: Path, results: Results) -> None:
 
 
 def _vertices_of(block: Block, layout: np.dtype) -> np.ndarray:
-    """(n,) points with the columns of `VERTEX`, in the layout of a file."""
+    """(n,) points with the columns of `VERTEX`, in the layout of the file."""
     vertices = np.empty(len(block), layout)
     vertices["x"], vertices["y"], vertices["z"] = block.points.T
     vertices["intensity"], vertices["ring"] = block.intensity, block.ring
@@ -83,10 +85,10 @@ def _vertices_of(block: Block, layout: np.dtype) -> np.ndarray:
 
 
 class MapFile:
-    """The keyframes of a map that `write` has written. Their poses in odometry are those in the map.
+    """The keyframes of a map written by `write`. Their odometry poses are their poses in the map.
 
     Raises:
-        HemislamError: it cannot be read, or is not such a map.
+        HemislamError: the file cannot be read, or is not such a map.
     """
 
     def __init__(self, path: Path) -> None:
@@ -98,7 +100,7 @@ class MapFile:
             raise HemislamError(f"The map {path} cannot be read: {error.strerror}.") from None
         except (ValueError, IndexError):
             raise HemislamError(
-                f"{path} is not a map of this version of hemislam; run it on the recording once more."
+                f"{path} is not a map of this version of hemislam; run hemislam on the recording again."
             ) from None
 
     def _read_ends(self, head: bytes) -> None:

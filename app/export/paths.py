@@ -1,4 +1,4 @@
-"""The trajectory as KITTI, CSV and GPX; the poses are those of the IMU at the scans' ends."""
+"""The trajectory as KITTI, CSV and GPX: poses of the IMU at the scans' ends."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ def write_kitti(path: Path, results: Results) -> None:
 
 
 def write_csv(path: Path, results: Results) -> None:
-    """Stamp and pose in the map and, if it is known where that is, easting, northing, height, latitude, longitude."""
+    """Stamp and pose in the map; if georeferenced, also easting, northing, height, latitude, longitude."""
     columns, places = "stamp_s,x_m,y_m,z_m,qx,qy,qz,qw", [""] * len(results.trajectory)
     if (where := results.where) is not None:
         columns += ",easting_m,northing_m,height_m,latitude_deg,longitude_deg"
@@ -44,7 +44,7 @@ def write_gpx(path: Path, results: Results) -> None:
 
 
 def name_of(recording: Path) -> str:
-    """Without its suffix, as UTF-8 whatever the bytes of the name are."""
+    """The file's name without its suffix, as UTF-8 whatever its bytes are."""
     return recording.stem.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
@@ -55,6 +55,6 @@ def utc_text(stamp_ns: int) -> str:
 
 
 def write_xml(path: Path, root: ElementTree.Element) -> None:
-    """With a declaration, indented."""
+    """Write indented XML with a declaration."""
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)

@@ -18,11 +18,11 @@ from app.export.results import Results
 FREE, WALL, UNKNOWN = 254, 0, 205
 """Grey values that nav2's map_server expects."""
 LEAST_POINTS = 3
-"""In a cell, to be a wall; fewer may be a person who walked past."""
+"""Fewest points of a wall in a cell; fewer may be a person who walked past."""
 
 
 def write_pgm(path: Path, results: Results) -> None:
-    """Walls, what is free by ground labels, and the rest, in the map."""
+    """Write a grid of walls, free cells (seen as ground) and unknown cells, in the map's frame."""
     raster = results.raster(on_earth=False)
     seen = raster.ground > 0
     free = seen | ndimage.binary_closing(seen, iterations=2)  # type: ignore[attr-defined]  # no types
@@ -33,7 +33,7 @@ def write_pgm(path: Path, results: Results) -> None:
 
 
 def write_yaml(path: Path, results: Results) -> None:
-    """What nav2's map_server needs beside the image."""
+    """Write the file that nav2's map_server needs with the image."""
     raster = results.raster(on_earth=False)
     x, y = raster.origin[:2]
     path.write_text(
@@ -44,21 +44,21 @@ def write_yaml(path: Path, results: Results) -> None:
 
 
 def write_floor_png(path: Path, results: Results) -> None:
-    """A horizontal slice, black on white; the darker, the more points."""
+    """Write a horizontal slice, black on white; the more points, the darker."""
     cut = results.raster(on_earth=True).cut
     grey = 255 - np.minimum(cut * 32, 255)
     Image.fromarray(np.flipud(grey).astype(np.uint8)).save(path, format="PNG")
 
 
 def write_world_file(path: Path, results: Results) -> None:
-    """Where floor.png lies, as GIS programs read it: size and turn of a pixel, middle of the upper left one."""
+    """Write the position of floor.png for GIS programs: size and rotation of a pixel, middle of the upper left one."""
     at = _transform(results.raster(on_earth=True))
     numbers = (at.a, at.d, at.b, at.e, at.c + at.a / 2, at.f + at.e / 2)
     path.write_text("".join(f"{number:.4f}\n" for number in numbers), encoding="ascii")
 
 
 def write_dxf(path: Path, results: Results) -> None:
-    """The outlines of what the slice cuts, in metres, on the layer `walls`."""
+    """Write the outlines of the slice, in metres, on the layer `walls`."""
     raster = results.raster(on_earth=True)
     walls = (np.flipud(raster.cut) >= LEAST_POINTS).astype(np.uint8)
     drawing: Any = ezdxf.new("R2010", units=6)
@@ -72,21 +72,21 @@ def write_dxf(path: Path, results: Results) -> None:
 
 
 def write_terrain(path: Path, results: Results) -> None:
-    """Mean height of the ground in each cell, m; nan where none was seen."""
+    """Write the mean height of the ground in each cell, m; NaN where no ground was seen."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
     above = "" if results.where is None else f", {results.where.height}"
     _write_tiff(path, results, raster, raster.height, f"height of the ground, m{above}")
 
 
 def write_density(path: Path, results: Results) -> None:
-    """Points per square metre."""
+    """Write the number of points per square metre."""
     raster = results.raster(on_earth=True, cell=COARSE_CELL)
     _write_tiff(path, results, raster, (raster.points / raster.cell**2).astype(np.float32), "points per square metre")
 
 
 def _write_tiff(path: Path, results: Results, raster: Raster, values: npt.NDArray[np.float32], what: str) -> None:
     rows, columns = values.shape
-    memory = MemoryFile()  # a disk that fails is no error to GDAL
+    memory = MemoryFile()  # GDAL does not report a failed disk
     with memory.open(
         driver="GTiff",
         height=rows,
@@ -104,6 +104,6 @@ def _write_tiff(path: Path, results: Results, raster: Raster, values: npt.NDArra
 
 
 def _transform(raster: Raster) -> Any:
-    """From columns and rows, counted from the north, to coordinates."""
+    """Convert columns and rows, counted from the north, to coordinates."""
     x, y = raster.origin[:2]
     return from_origin(x, y + raster.points.shape[0] * raster.cell, raster.cell, raster.cell)

@@ -1,11 +1,11 @@
-"""How large viser's page draws points: visible from afar, and no discs right before the camera."""
+"""Limits the size at which viser's page draws points: visible from afar, but no discs right before the camera."""
 
 from typing import Final
 
 LEAST_PX, MOST_PX = 1.5, 12.0
-"""Of a point's diameter, on the screen."""
+"""Limits of a point's diameter on the screen."""
 VISERS: Final = "gl_PointSize = (scale / -world_pos.z);"
-"""The line of viser's shader that is replaced; `tests/export/test_point_sizes.py` says whether it is still there."""
+"""The replaced line of viser's shader; `tests/export/test_point_sizes.py` checks that it still exists."""
 _SCRIPT: Final = f"""<script>{{
   const compile = WebGL2RenderingContext.prototype.shaderSource;
   WebGL2RenderingContext.prototype.shaderSource = function (shader, text) {{
@@ -18,5 +18,5 @@ _HEAD: Final = "<head>"
 
 
 def with_point_sizes(page: str) -> str:
-    """viser's page, in which points have a least and a largest size."""
+    """viser's page with a least and a largest size of points."""
     return page.replace(_HEAD, _HEAD + _SCRIPT, 1)

@@ -1,6 +1,6 @@
 """The points of a map as a stream, one keyframe at a time, so that memory does not grow with the map.
 
-Only thinning keeps something of the whole map: its occupied voxels.
+Only thinning stores data of the whole map: the occupied voxels.
 """
 
 import math
@@ -23,10 +23,10 @@ class Choice:
     """Which points of a map are exported.
 
     Attributes:
-        thin: m, edge of the voxels of which only the first point is taken; 0: all points.
-        box: in which they lie; None: everywhere.
-        slab: m, width of the slab along the walked path that a profile shows.
-        moving: also those on what moves.
+        thin: m, edge of voxels; only the first point in each is exported. 0: all points.
+        box: only points inside; None: everywhere.
+        slab: m, width of a profile's slab along the walked path.
+        moving: include points on moving objects.
     """
 
     thin: float = 0.0
@@ -51,7 +51,7 @@ class Block:
     """Points of one keyframe in the map.
 
     Attributes:
-        keyframe: its index. stamp_ns: its scan's end. T_map_lidar: (4, 4).
+        keyframe: index. stamp_ns: end of its scan. T_map_lidar: (4, 4).
         points: (n, 3) float64 m, map. stamps_ns: (n,) of each point.
         labels, intensity, ring: (n,) as in `Cloud`.
     """
@@ -75,7 +75,7 @@ class Block:
 
 
 def blocks(keyframes: Keyframes, frame: MapFrame, choice: Choice) -> Iterator[Block]:
-    """The chosen points, where `frame` puts them in the map."""
+    """The chosen points, placed in the map by `frame`."""
     voxels = Voxels(choice.thin) if choice.thin else None
     for index in range(len(keyframes)):
         block = _block(keyframes[index], frame.at(index))
@@ -91,21 +91,21 @@ def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
     T = T_map_odom @ keyframe.T_odom_imu @ keyframe.T_imu_lidar
     points = np.empty((len(cloud), 3))
     transform(cloud.points, T, points)
-    # offsets count from the scan's end; in older stores, from its begin, and the last point is taken for the end
+    # offsets count from the scan's end; in older stores from its begin, where the last point counts as the end
     begin_ns = keyframe.stamp_ns - int(cloud.offsets_ns.max(initial=0))
     stamps_ns = begin_ns + cloud.offsets_ns.astype(np.int64)
     return Block(keyframe.index, keyframe.stamp_ns, T, points, stamps_ns, cloud.labels, cloud.intensity, cloud.ring)
 
 
 class Voxels:
-    """Voxels that hold a point already: 8 bytes each, twice as many slots as voxels."""
+    """Set of occupied voxels: 8 bytes per slot, at least two slots per voxel."""
 
     def __init__(self, edge: float) -> None:
         self._edge, self._used = edge, 0
         self._table = np.full(1 << 16, -1, np.int64)
 
     def new(self, points: F64) -> npt.NDArray[np.bool_]:
-        """(n,) whether each point is the first in its voxel; it is in it from now on."""
+        """(n,) mask of the points that are the first in their voxels, which are occupied from now on."""
         cells = np.floor(points / self._edge).astype(np.int64) & 0x1FFFFF
         keys = cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
         if 2 * (self._used + len(keys)) > len(self._table):

@@ -1,4 +1,4 @@
-"""The map from above: what lies in each cell of a grid. The points are read three times, so that none is held."""
+"""The map from above: counts in the cells of a grid. The points are read three times, so that none must be stored."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -13,16 +13,16 @@ from app.slam.errors import HemislamError
 from app.slam.types import F64, U8, Mask, is_ground
 
 CELL = 0.05
-"""m, edge of a cell of all but huge maps."""
+"""m, edge of a cell; larger for huge maps."""
 COARSE_CELL = 0.25
-"""m, of terrain, density and the picture for Google Earth."""
+"""m, edge of a cell of terrain, density and the picture for Google Earth."""
 MOST_CELLS = 16_000_000
 COARSE = 10
-"""Cells along the edge of a square in which the ground has one height."""
+"""Cells along the edge of a square with a single ground height."""
 WALL_FROM, WALL_TO = 0.2, 1.8
-"""m above the ground: what a robot, or a person, would run into."""
+"""m above the ground: heights at which a robot or a person would hit an obstacle."""
 SLICE_FROM, SLICE_TO = 1.0, 1.5
-"""m above the ground: a floor plan shows what is cut there, above tables and below lamps."""
+"""m above the ground: heights of a floor plan's slice, above tables and below lamps."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Raster:
     """Counts in cells, row 0 in the south.
 
     Attributes:
-        origin: (3,) x, y of the outer corner of cell (0, 0), and what was subtracted from heights, m.
-        cell: m. points, ground, walls, cut: (rows, columns) int32, number of points: all, of the ground, and in the
-            two ranges of height above it. height_sum: (rows, columns) of ground points, m.
+        origin: (3,) m, x and y of the outer corner of cell (0, 0), and the offset subtracted from heights.
+        cell: m. points, ground, walls, cut: (rows, columns) int32, numbers of all points, of ground points, and of
+            points in the two ranges of height above ground. height_sum: (rows, columns) of ground points, m.
     """
 
     origin: F64
@@ -45,7 +45,7 @@ class Raster:
 
     @property
     def height(self) -> npt.NDArray[np.float32]:
-        """(rows, columns) m, mean of the ground points; nan without one."""
+        """(rows, columns) m, mean height of the ground points; NaN without ground points."""
         with np.errstate(invalid="ignore"):
             mean = self.height_sum / self.ground + self.origin[2]
         return np.where(self.ground > 0, mean, np.nan).astype(np.float32)
@@ -55,7 +55,7 @@ def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, c
     """Count the chosen points of a map.
 
     Args:
-        read: gives the points, from the start on each call. where: the raster's place on Earth; None: in the map.
+        read: returns all points anew on each call. where: georeference of the raster; None: the map's frame.
         cell: m.
 
     Raises:
@@ -93,7 +93,7 @@ def rasterise(read: Callable[[], Iterable[Block]], where: GeoReference | None, c
 def _floor(
     read: Callable[[], Iterable[Block]], where: GeoReference | None, origin: F64, cell: float, shape: tuple[int, int]
 ) -> F64:
-    """(rows, columns) of coarse squares: mean height of the ground, m; where none was seen, of the nearest one."""
+    """(rows, columns) of coarse squares: mean height of the ground, m; without ground, that of the nearest square."""
     total, count = np.zeros((2, shape[0] // COARSE, shape[1] // COARSE))
     for points, labels in _points(read, where):
         points = points[is_ground(labels)]
@@ -103,7 +103,7 @@ def _floor(
     if not count.any():
         raise HemislamError("No point of the map is ground, and a plan starts from the ground; tune the ground first.")
     unseen = count == 0
-    from scipy import ndimage  # every run imports this module, and few draw a plan
+    from scipy import ndimage  # imported here: every run loads this module, but few draw a plan
 
     nearest = ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True)  # type: ignore[attr-defined]  # no types
     mean = total / np.maximum(count, 1)

@@ -1,4 +1,4 @@
-"""Points of maps that this program or others have written: PLY, LAS and LAZ, read piece by piece and thinned."""
+"""Reads the points of maps written by this or other programs, piece by piece and thinned: PLY, LAS and LAZ."""
 
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -14,11 +14,11 @@ from app.slam.errors import HemislamError
 from app.slam.types import F64
 
 CLOUDS = (".ply", ".las", ".laz")
-"""Suffixes of what can be read."""
+"""Suffixes of files that can be read."""
 PIECE = 1_000_000
-"""Points that are read at once."""
+"""Points read at once."""
 _FARTHEST_M = 1e9
-"""No grid on Earth reaches that far."""
+"""No grid on Earth has larger coordinates."""
 _KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -31,10 +31,10 @@ def read_points(path: Path, thin: float, progress: Callable[[float], None] = lam
     """(n, 3) float64, the first point in each voxel of `thin` m, in the file's coordinates.
 
     Args:
-        progress: called with the share that is read, 0-1.
+        progress: called with the share read so far, 0-1.
 
     Raises:
-        HemislamError: the file cannot be read, is none of these, or holds no points.
+        HemislamError: the file cannot be read, has none of these formats, or holds no points.
     """
     read = {".ply": _ply, ".las": _las, ".laz": _las}.get(path.suffix.lower())
     if read is None:
@@ -42,7 +42,7 @@ def read_points(path: Path, thin: float, progress: Callable[[float], None] = lam
     voxels, taken = Voxels(thin), [np.empty((0, 3))]
     try:
         for share, points in read(path):
-            points = points[(np.abs(points) < _FARTHEST_M).all(axis=1)]  # nan neither
+            points = points[(np.abs(points) < _FARTHEST_M).all(axis=1)]  # also drops NaN
             taken.append(points[voxels.new(points)])
             progress(share)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What result files are written from: the frames, keyframes and loops of a session, and what was found about them."""
+"""The data from which result files are written: frames, keyframes and loops of a session, and facts about them."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -17,7 +17,7 @@ from app.slam.ply import Keyframes
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.trajectory import Trajectory
 
-if TYPE_CHECKING:  # every run imports this module, and few need the solver
+if TYPE_CHECKING:  # every run imports this module, but few need the solver
     from app.georeference.align import Alignment
 
 MapMark = tuple[str, tuple[tuple[int, tuple[float, float, float]], ...]]
@@ -25,18 +25,18 @@ MapMark = tuple[str, tuple[tuple[int, tuple[float, float, float]], ...]]
 
 @dataclass
 class Results:
-    """What the result files are written from.
+    """The data from which the result files are written.
 
     Attributes:
-        loops: None if loops were not searched. adjustment: of the map that they give: levels it, by
-            `levelled_deg`, and bends it to fixes.
-        report: what report.json holds; complete once it is written.
-        choice: of points. where: the map's place on Earth, if known. found: how fixes or points fit it, if these
-            results were georeferenced. problem: why they could not be, in a sentence.
-        marks: what was measured, each a name and its spots: keyframe and (x, y, z) m in its IMU frame.
-        notes: taken in the session, each the index of a frame and a text.
-        progress: called with the share of the points that a file has got, 0-1, for each file.
-        sha256: of the recording, computed once report.json is to be written; None if it cannot be read.
+        loops: None if loops were not searched. adjustment: of the map after loops: levels it by `levelled_deg`, and
+            bends it to fixes.
+        report: content of report.json; complete once that is written.
+        choice: of points. where: georeference of the map, if known. found: fit of fixes or control points, if these
+            results were georeferenced. problem: why they could not be georeferenced, in a sentence.
+        marks: measures, each a name and its spots: keyframe and (x, y, z) m in the keyframe's IMU frame.
+        notes: of the session, each a frame's index and a text.
+        progress: called with the share of the points written, 0-1, for each file.
+        sha256: of the recording, computed when report.json is written; None if the recording cannot be read.
     """
 
     log: RunLog
@@ -59,7 +59,7 @@ class Results:
 
     @property
     def frame(self) -> MapFrame:
-        """Where odometry lies in the map."""
+        """The transform from odometry to the map."""
         return self.adjustment.over(self.loops.frame if self.loops else MapFrame())
 
     @cached_property
@@ -68,11 +68,11 @@ class Results:
         return self.frame.trajectory(self.log.odometry)
 
     def blocks(self) -> Iterator[Block]:
-        """The chosen points in the map, keyframe by keyframe. Only one of them is held at a time."""
+        """The chosen points in the map, keyframe by keyframe; only one keyframe is in memory at a time."""
         return self._blocks(self.choice)
 
     def still_blocks(self) -> Iterator[Block]:
-        """The same without points on what moves, for files that cannot mark them."""
+        """As `blocks`, without points on moving objects, for formats that cannot mark them."""
         return self._blocks(replace(self.choice, moving=False))
 
     def _blocks(self, choice: Choice) -> Iterator[Block]:
@@ -85,14 +85,14 @@ class Results:
             raise HemislamError("There are no points in the box; choose another one.")
 
     def raster(self, *, on_earth: bool, cell: float = CELL) -> Raster:
-        """The map from above, counted once for all files that show it."""
+        """The map from above, computed once for all files that show it."""
         key = on_earth and self.where is not None, cell
         if key not in self._rasters:
             self._rasters[key] = rasterise(self.still_blocks, self.where if on_earth else None, cell)
         return self._rasters[key]
 
     def section(self, kind: str) -> Slab:
-        """A slab of the map from its side, counted once for all files that show it. kind: section or profile."""
+        """A slab of the map from its side, computed once for all files that show it. kind: section or profile."""
         if kind not in self._sections:
             self._sections[kind] = (
                 of_box(self.still_blocks, self.choice.box, self.where)

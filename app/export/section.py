@@ -1,4 +1,4 @@
-"""A slab of the map from its side: what lies in a box, or along the walked path as a profile."""
+"""A slab of the map from its side: a section through a box, or a profile along the walked path."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -16,15 +16,15 @@ from app.slam.kernels.clouds import passages
 from app.slam.types import F64, U8, is_ground
 
 CELL: Final = 0.02
-"""m, of all but huge sections."""
+"""m, edge of a cell; larger for huge sections."""
 MOST_CELLS: Final = 8_000_000
 MOST_COLUMNS: Final = 20_000
-"""Many programs do not open wider pictures."""
+"""Many programs cannot open wider pictures."""
 STRIDE: Final = 0.5
-"""m, length of a step along the path: a shorter one would follow the walker's sway."""
+"""m, least length of a step along the path: shorter steps would follow the walker's sway."""
 
 Placed = Callable[[Block], tuple[F64, U8]]
-"""Gives (n, 2) chainage and height of the points in the slab, m, and their labels."""
+"""Returns (n, 2) chainage and height (m) of the points in the slab, and their labels."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Slab:
 
     Attributes:
         origin: (2,) chainage and height of the lower left corner of cell (0, 0), m. cell: m.
-        points, ground: (rows, columns) int32, numbers of points, and of those on the ground.
-        sums: (rows, columns, 2) float32 m, sum of where they are in their cell.
+        points, ground: (rows, columns) int32, numbers of all points, and of ground points.
+        sums: (rows, columns, 2) float32 m, sums of the points' positions in their cell.
     """
 
     origin: F64
@@ -45,11 +45,11 @@ class Slab:
 
     @property
     def size(self) -> F64:
-        """(2,) m, its length and height."""
+        """(2,) m, length and height of the slab."""
         return self.cell * np.array(self.points.shape[::-1], np.float64)
 
     def means(self) -> tuple[F64, npt.NDArray[np.bool_]]:
-        """(n, 2) m, the mean of the points in each cell that has some, and (n,) whether most of them are ground."""
+        """(n, 2) m, mean of the points in each non-empty cell, and (n,) whether most of them are ground."""
         rows, columns = np.nonzero(self.points)
         count = self.points[rows, columns]
         at = self.origin + np.column_stack([columns, rows]) * self.cell + self.sums[rows, columns] / count[:, None]
@@ -57,13 +57,13 @@ class Slab:
 
 
 def of_box(read: Callable[[], Iterable[Block]], box: Box | None, where: GeoReference | None) -> Slab:
-    """What lies in the box, from its front; chainage begins at its left side.
+    """The content of the box, seen from its front; chainage begins at its left side.
 
     Args:
-        read: gives the points, from the start on each call. where: the map's place on Earth; None: heights of the map.
+        read: returns all points anew on each call. where: georeference, for heights; None: heights in the map.
 
     Raises:
-        HemislamError: no box is chosen, or nothing is in it.
+        HemislamError: no box is chosen, or it contains no points.
     """
     if box is None:
         raise HemislamError("A section shows what lies in a box; choose a box first.")
@@ -76,7 +76,7 @@ def of_box(read: Callable[[], Iterable[Block]], box: Box | None, where: GeoRefer
 
 
 def of_path(read: Callable[[], Iterable[Block]], positions: F64, half: float, where: GeoReference | None) -> Slab:
-    """What lies within `half` m beside a walked path, (n, 3) m; chainage is the way walked, from above. As `of_box`.
+    """The points within `half` m beside a walked path, (n, 3) m; chainage is the horizontal path length. As `of_box`.
 
     Raises:
         HemislamError: the path has no length, or no points lie beside it.
@@ -91,7 +91,7 @@ def of_path(read: Callable[[], Iterable[Block]], positions: F64, half: float, wh
 
 
 def strides(positions: F64) -> F64:
-    """(m, 2) of (n, 2) m, the first of them, every one that is a stride from the one before, and the last.
+    """(m, 2) of (n, 2) positions, m: the first, each at least a stride from the one before, and the last.
 
     Raises:
         HemislamError: all of them are within a stride.
@@ -122,7 +122,7 @@ def along_path(points: F64, path: F64, half: float) -> tuple[npt.NDArray[np.int6
 
 
 def heights(points: F64, where: GeoReference | None) -> F64:
-    """(n,) m, heights of points of the map: z, or their heights on Earth where these are known."""
+    """(n,) m, heights of points of the map: on Earth if georeferenced, else z."""
     return points[:, 2] if where is None else where.to_crs(points)[:, 2]
 
 

@@ -1,4 +1,4 @@
-"""Sections and profiles as PNG, SVG and DXF: chainage to the right, height up, both in metres and to the same scale."""
+"""Sections and profiles as PNG, SVG and DXF: chainage to the right, height up, both in metres at the same scale."""
 
 import math
 from collections.abc import Iterator
@@ -16,15 +16,15 @@ from app.export.section import Slab
 GROUND, OTHER = "#0f8f7a", "#20262e"
 _GRID, _TEXT = "#c9d0d8", "#4a5560"
 _MARGIN: Final = (90, 40, 40, 60)
-"""Pixels at the left, top, right and bottom of a picture, for numbers."""
+"""Margins for numbers at the left, top, right and bottom of a picture, pixels."""
 _APART: Final = 90, 25
-"""Pixels between two numbers, at least: beside and above one another."""
+"""Least distances between two numbers, horizontally and vertically, pixels."""
 _MM: Final = 10.0
-"""Millimetres of an SVG for each metre: 1:100."""
+"""Millimetres in an SVG per metre: scale 1:100."""
 
 
 def write_png(path: Path, results: Results, section: Slab) -> None:
-    """A pixel for each cell: darker with more points, ground in green."""
+    """Draw a pixel for each cell, darker with more points; ground in green."""
     rows, columns = section.points.shape
     left, top, right, bottom = _MARGIN
     picture = Image.new("RGB", (left + columns + right, top + rows + bottom), "white")
@@ -45,7 +45,9 @@ def write_png(path: Path, results: Results, section: Slab) -> None:
         draw.text((left - 8, y), f"{at:g}", _TEXT, font, anchor="rm")
     draw.text((left, top - 12), _title(results), _TEXT, font, anchor="ls")
     draw.text((left, top + rows + 32), _caption(results), _TEXT, font, anchor="lt")
-    black = max(4.0, float(np.percentile(section.points[section.points > 0], 90)))  # as many points in a cell
+    black = max(
+        4.0, float(np.percentile(section.points[section.points > 0], 90))
+    )  # this many points in a cell are black
     share = np.where(section.points > 0, 90 + 165 * np.minimum(section.points / black, 1.0), 0.0)
     is_ground = 2 * section.ground > section.points
     for colour, which in ((OTHER, ~is_ground), (GROUND, is_ground)):
@@ -55,7 +57,7 @@ def write_png(path: Path, results: Results, section: Slab) -> None:
 
 
 def write_svg(path: Path, results: Results, section: Slab) -> None:
-    """1:100 on paper: a dot for each cell with points, at their mean to the millimetre, over a grid."""
+    """Draw at 1:100 over a grid: a dot for each non-empty cell, at the mean of its points to the millimetre."""
     (length, height), steps = section.size.tolist(), [_step(apart / 4 / _MM) for apart in _APART]
     size = length + 3.0, height + 2.5  # m, with the margins
     root = ElementTree.Element(
@@ -88,8 +90,8 @@ def write_svg(path: Path, results: Results, section: Slab) -> None:
 
 
 def write_dxf(path: Path, results: Results, section: Slab) -> None:
-    """A point for each cell with points, at their mean, in metres: x is the chainage, y the height."""
-    import ezdxf  # of the extra
+    """Write a point for each non-empty cell, at the mean of its points, in metres: x is chainage, y height."""
+    import ezdxf  # from the extra `plan`
 
     drawing: Any = ezdxf.new("R2010", units=6)
     space = drawing.modelspace()
@@ -112,7 +114,7 @@ def _caption(results: Results) -> str:
 
 
 def _step(least: float) -> float:
-    """The smallest of 1, 2 or 5 times a power of ten that is not less."""
+    """The smallest value of 1, 2 or 5 times a power of ten that is not less than `least`."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= least * (1 - 1e-9))
 

@@ -18,14 +18,14 @@ from app.slam.types import F32, F64, U8
 
 MOST_POINTS = 1_000_000
 TILE = 16.0
-"""m: float16 holds x and y in a tile to 4 mm; z less finely where it is far from the tile's median."""
+"""m: in a tile, float16 resolves x and y to 4 mm; z is coarser far from the tile's median."""
 STOPS = np.array([[40, 60, 150], [30, 150, 160], [120, 195, 110], [240, 200, 70], [225, 90, 50]], np.float64)
 """Colours from low to high."""
 PATH, LOOP, MARK, ARROW = (255, 255, 255), (255, 120, 40), (120, 255, 160), (255, 60, 60)
 
 
 def write(path: Path, results: Results) -> None:
-    """Points to a budget, trajectory, loops, notes, measures, a scale, an arrow to the north, title, credits."""
+    """Write some of the points, trajectory, loops, notes, measures, a scale, a north arrow, title and credits."""
     points, keyframes = _sample(results)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints when it starts and stops
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -42,7 +42,7 @@ def write(path: Path, results: Results) -> None:
 
 
 def _sample(results: Results) -> tuple[F32, F64]:
-    """(n, 3) m, a fair sample of the chosen points below ceilings, and (k, 3) the keyframes' positions."""
+    """(n, 3) m, a random sample of the chosen points below ceilings, and (k, 3) m, the keyframes' positions."""
     total, rng = sum(len(block) for block in results.still_blocks()), np.random.default_rng(0)
     taken, keyframes = [np.empty((0, 3), np.float32)], []
     for block in results.still_blocks():
@@ -60,7 +60,7 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: Resul
     colours = _colours(points[:, 2])
     tiles, which = np.unique(np.floor(points[:, :2] / TILE).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(which.ravel())))  # and an empty one after the last tile
+    parts = np.split(order, np.cumsum(np.bincount(which.ravel())))  # with an empty part after the last tile
     for number, (tile, part) in enumerate(zip(tiles, parts, strict=False)):
         center = np.append((tile + 0.5) * TILE, np.median(points[part, 2]))
         own = (points[part] - center).astype(np.float32)
@@ -79,7 +79,7 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: Resul
         if 0 <= frame < len(trajectory):
             scene.add_label(f"/notes/{number}", text, position=tuple(trajectory[frame]))
     seen = points if len(points) else np.zeros((1, 3), np.float32)
-    low, high = np.percentile(seen, [1, 99], axis=0)  # a few far points would make the rest small
+    low, high = np.percentile(seen, [1, 99], axis=0)  # a few far points would shrink the rest
     _add_scale_and_arrow(server, low, high, results)
     center, size = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) + 1.0
     server.initial_camera.position = tuple(center + size * np.array([-0.26, -0.42, 0.45]))
@@ -87,7 +87,7 @@ def _draw(server: viser.ViserServer, points: F32, keyframes: F64, results: Resul
 
 
 def marked(results: Results) -> list[tuple[str, F64]]:
-    """What was measured: name, with the distance of two points, and the (k, 3) m places in the map."""
+    """The measures: name, with the distance if there are two points, and (k, 3) m, their places in the map."""
     found = []
     for name, spots in results.marks:
         if all(0 <= index < len(results.keyframes) for index, _ in spots):
@@ -107,21 +107,23 @@ def _colours(heights: F32) -> U8:
     if not len(heights):
         return np.empty((0, 3), np.uint8)
     low, high = np.percentile(heights, [2, 98])
-    share = np.round(np.clip((heights - low) / max(high - low, 1e-6), 0, 1) * 63) / 63  # few colours make small files
+    share = (
+        np.round(np.clip((heights - low) / max(high - low, 1e-6), 0, 1) * 63) / 63
+    )  # few colours keep the file small
     return np.stack([np.interp(share, np.linspace(0, 1, len(STOPS)), stop) for stop in STOPS.T], axis=1).astype(
         np.uint8
     )
 
 
 def _loops(g2o: str, keyframes: int) -> np.ndarray:
-    """(m, 2) pairs of keyframes that a loop ties: edges of the graph that do not follow each other."""
+    """(m, 2) pairs of keyframes tied by a loop: edges of the graph between keyframes that are not consecutive."""
     edges = [line.split()[1:3] for line in g2o.splitlines() if line.startswith("EDGE_SE3")]
     pairs = [(int(a), int(b)) for a, b in edges if abs(int(a) - int(b)) > 1]
     return np.array([pair for pair in pairs if max(pair) < keyframes], np.int64).reshape(-1, 2)
 
 
 def _add_scale_and_arrow(server: viser.ViserServer, low: F64, high: F64, results: Results) -> None:
-    """On the left of the first picture, beside nearly all of the map."""
+    """Add them at the left of the initial view, beside nearly all of the map."""
     width = float(max((high - low)[:2].max(), 1.0))
     decade = 10.0 ** math.floor(math.log10(width / 4))
     length = next(step * decade for step in (5, 2, 1) if step * decade <= width / 4 * 1.0001)
