@@ -12,33 +12,33 @@ from app.slam import lie
 from app.slam.types import F64, I64, Mask, Scan
 
 REACH = 5
-"""Neighbours on each side of a point that its curvature is measured from."""
+"""Number of neighbours on each side of a point from which its curvature is computed."""
 SECTORS = 6
-"""Equal parts of each scan line, so that features come from all sides."""
+"""Number of equal sectors of each scan line, so that features come from all directions."""
 EDGES, PLANES = 2, 4
-"""The sharpest and the flattest points of each sector, to be matched with the scan before."""
+"""Number of the sharpest and of the flattest points in each sector to match with the previous scan."""
 MORE_EDGES = 12
-"""Edge points of each sector that go into the map."""
+"""Number of edge points in each sector to add to the map."""
 SHARP, FLAT = 0.4, 0.2
-"""Curvature, without unit, above which a point may be an edge, and below which it may be on a plane. A right angle
-seen from its bisector has 0.7."""
+"""Curvature, without unit, above which a point may be an edge, and below which it may lie on a plane. A right angle
+seen along its bisector has 0.7."""
 NOISE_M = 0.04
-"""Distance between a point and the middle of its neighbours that noise alone may cause."""
+"""Distance between a point and the mean of its neighbours that noise alone may cause."""
 OCCLUSION = 0.1
-"""Share of the range by which two neighbours' ranges differ where the nearer surface hides the farther one."""
+"""Relative difference of two neighbours' ranges above which the nearer surface hides the farther one."""
 GRAZING = 8.0
-"""Distance between neighbours over that of a surface seen head-on, above which the beam runs along the surface."""
+"""Ratio of the neighbours' distance to that on a surface seen head-on, above which the beam grazes the surface."""
 GAP = 3.5
-"""Angle between neighbours over the usual one, above which returns are missing in between."""
+"""Ratio of the angle between neighbours to the usual angle, above which returns are missing in between."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeaturePoints:
-    """Points of a scan with what matching needs to know of them.
+    """Points of a scan, with the data needed for matching.
 
     Attributes:
-        points: (n, 3) m, LiDAR frame, each at its own time. lines: (n,) scan line. shares: (n,) 0-1, time of each
-            point as a share of the time from the scan's first to its last point.
+        points: (n, 3) m, LiDAR frame at each point's own time. lines: (n,) scan line. shares: (n,) 0-1, time of each
+            point as a share of the time from the scan's first point to its last.
     """
 
     points: F64
@@ -58,7 +58,7 @@ class FeaturePoints:
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """`edges` and `planes` are the best few; `edge_map` and `plane_map` hold them and many more."""
+    """`edges` and `planes` hold the few best points; `edge_map` and `plane_map` hold these and many more."""
 
     edges: FeaturePoints
     planes: FeaturePoints
@@ -66,19 +66,19 @@ class Features:
     plane_map: FeaturePoints
 
     def seen_at_end(self, motion: F64) -> "Features":
-        """All points as seen from the scan's end, if the LiDAR moved by T_begin_end (4, 4) at constant velocity."""
+        """All points in the LiDAR frame at the scan's end, if it moved by T_begin_end (4, 4) at constant velocity."""
         return Features(*(getattr(self, name).seen_at_end(motion) for name in Features.__slots__))
 
 
 def undistorted(points: F64, shares: F64, motion: F64) -> F64:
-    """(n, 3) points as seen from the scan's end, each measured at a share (n,) of the motion T_begin_end."""
+    """(n, 3) points in the frame at the scan's end, each measured at a share (n,) of the motion T_begin_end."""
     R = lie.exp((shares - 1)[:, None] * lie.log(motion[:3, :3]))
     back = np.asarray(motion[:3, :3].T @ motion[:3, 3])
     return np.asarray(np.einsum("nij,nj->ni", R, points) + (shares - 1)[:, None] * back)
 
 
 def extract(scan: Scan, near: float, far: float) -> Features:
-    """The features of a scan within `near` to `far` m. A scan without lines has rings of elevation in their place."""
+    """The features of a scan within `near` to `far` m. A scan without lines is divided into rings by elevation."""
     ranges = np.linalg.norm(scan.points, axis=1)
     kept = np.flatnonzero((ranges >= near) & (ranges <= far))
     points = scan.points[kept].astype(np.float64)
@@ -108,13 +108,13 @@ def extract(scan: Scan, near: float, far: float) -> Features:
 
 
 def curvatures(cloud: FeaturePoints) -> tuple[F64, F64, Mask]:
-    """Curvature of points in order of line and azimuth.
+    """Curvature of points sorted by line and azimuth.
 
-    c = |sum over neighbours j of (X_i - X_j)| / sum of |X_i - X_j|. Eq. 1 divides by the range instead, which takes an
-    oblique wall for an edge if the scanner's azimuths are far apart.
+    c = |sum over neighbours j of (X_i - X_j)| / sum of |X_i - X_j|. Eq. 1 divides by the range instead, which mistakes
+    an oblique wall for an edge if the scanner's azimuth steps are large.
 
     Returns:
-        (n,) curvature, 0-1. (n,) m from the point to the middle of its neighbours. (n,) where both were measured.
+        (n,) curvature, 0-1. (n,) m, distance to the mean of the neighbours. (n,) mask of the points that have both.
     """
     n = len(cloud)
     difference, reach = np.zeros((n, 3)), np.zeros(n)
@@ -129,7 +129,7 @@ def curvatures(cloud: FeaturePoints) -> tuple[F64, F64, Mask]:
 
 
 def unreliable(cloud: FeaturePoints) -> Mask:
-    """(n,) points beside a gap, behind something nearer, or on a surface that runs along the beam (Fig. 4)."""
+    """(n,) mask of points beside a gap, behind a nearer surface, or on a surface grazed by the beam (Fig. 4)."""
     ranges = np.linalg.norm(cloud.points, axis=1)
     directions = cloud.points / ranges[:, None]
     step = np.linalg.norm(np.diff(directions, axis=0), axis=1)
@@ -150,7 +150,7 @@ def unreliable(cloud: FeaturePoints) -> Mask:
 
 
 def _usual(step: F64, lines: I64, same: Mask) -> F64:
-    """(n,) the median of the steps (n,) of the same line."""
+    """(n,) for each of the steps (n,), the median on its line."""
     usual = np.zeros(int(lines.max()) + 1)
     for line in np.unique(lines):
         steps = step[(lines == line) & same]
@@ -159,14 +159,14 @@ def _usual(step: F64, lines: I64, same: Mask) -> F64:
 
 
 def _sectors(lines: I64) -> I64:
-    """(n,) number of the sector of each point, of lines in order."""
+    """(n,) number of each point's sector, for sorted lines."""
     begins = np.searchsorted(lines, lines)
     counts = np.searchsorted(lines, lines, side="right") - begins
     return np.asarray(lines * SECTORS + (np.arange(len(lines)) - begins) * SECTORS // counts)
 
 
 def _ranks(sectors: I64, values: F64, candidates: Mask) -> I64:
-    """(n,) rank of each candidate in its sector, the smallest value first; a huge one for others."""
+    """(n,) rank of each candidate in its sector, smallest value first; a huge rank for other points."""
     ranks = np.full(len(sectors), np.iinfo(np.int64).max)
     index = np.flatnonzero(candidates)
     order = index[np.lexsort((values[index], sectors[index]))]

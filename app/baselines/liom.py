@@ -1,8 +1,8 @@
-"""LIOM, the paper's second baseline: IMU and LiDAR tightly coupled in a window of scans, refined on a map. No loops.
+"""LIOM, the paper's second baseline: tightly coupled IMU and LiDAR in a window of scans, refined on a map. No loops.
 
 Written from Ye, Chen and Liu, "Tightly Coupled 3D Lidar Inertial Odometry and Mapping", ICRA 2019. Where the paper
-has a factor for each point, a scan's points make one factor here: the pose relative to the window's first scan that
-fits them, with their information, so the IMU determines what they leave open.
+has a factor for each point, all points of a scan form one factor here: their best-fitting pose relative to the window's
+first scan, with its information matrix. So the IMU determines the directions that the points do not constrain.
 """
 
 from collections import deque
@@ -22,21 +22,21 @@ from app.slam.sections import ImuParams
 from app.slam.types import F64, ImuSamples, Measurement, NavState
 
 WINDOW = 10
-"""Scans whose states are estimated together; older ones are marginalised."""
+"""Number of scans whose states are estimated jointly; older ones are marginalised."""
 MAP_EVERY = 2
-"""Scans between two refinements on the map."""
+"""Number of scans between two refinements on the map."""
 ROUNDS = 4
 """How often points are matched again."""
 WINDOW_VOXELS_M, MAP_VOXELS_M, MAP_REACH_M = (0.2, 0.3), (0.2, 0.4), 80.0
-"""Of edges and of planes."""
+"""Voxel sizes of edges and of planes, m."""
 POINT_NOISE_M = 0.1
-"""Of a point's distance to its plane. Neighbours share their plane's error, so this is more than the sensor's noise."""
+"""Sigma of a point's distance to its plane. Neighbours share their plane's error, so it exceeds the sensor's noise."""
 UPRIGHT = np.eye(6)[2:]
-"""The paper's rotational constraint: the map corrects heading and position only, since the IMU knows roll and pitch."""
+"""The paper's rotational constraint: the map corrects only heading and position; the IMU observes roll and pitch."""
 
 
 class Liom:
-    """LIOM on one recording. `step` takes scans in order."""
+    """LIOM on one recording. Call `step` with the scans in order."""
 
     def __init__(self, params: Params) -> None:
         self._params, self._T_imu_lidar = params, mounting(params)
@@ -78,14 +78,14 @@ class Liom:
         return scan.end_ns, self._T_map_odom @ T_odom_imu
 
     def _begin(self, state: NavState) -> None:
-        """The first window, from the state at the end of the start."""
+        """Begin the first window from the state at the end of the initialisation."""
         self._bias = gtsam.imuBias.ConstantBias(state.b_accel, state.b_gyro)
         pose = gtsam.Pose3(state.T_odom_imu)
         self._state, self._stamp_ns = gtsam.NavState(pose, state.v_odom_imu), state.stamp_ns
         self._restart(1e-3, 0.1)
 
     def _restart(self, pose_sigma: float, speed_sigma: float) -> None:
-        """A new window from the present state; also where the smoother has failed. The sigmas: m and rad; m/s."""
+        """Begin a new window from the present state, also after a failure of the smoother. Sigmas: m and rad; m/s."""
         graph, values, k = gtsam.NonlinearFactorGraph(), gtsam.Values(), self._index
         of = gtsam.noiseModel.Isotropic.Sigma
         bias = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.05] * 3 + [0.01] * 3))
@@ -98,7 +98,7 @@ class Liom:
         self._smoother.update(graph, values, {key: float(k) for key in (X(k), V(k), B(k))})
 
     def _summed(self, imu: ImuSamples, end_ns: int) -> gtsam.PreintegratedCombinedMeasurements:
-        """The samples from the last state to `end_ns`, preintegrated (their section III.B)."""
+        """Preintegrate the samples from the last state to `end_ns` (their section III.B)."""
         summed = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
         inside = (imu.stamps_ns > self._stamp_ns) & (imu.stamps_ns < end_ns)
         at = (np.concatenate([[self._stamp_ns], imu.stamps_ns[inside], [end_ns]]) - self._stamp_ns) * 1e-9
@@ -148,19 +148,19 @@ class Liom:
             estimate = self._smoother.calculateEstimate()
             self._state = gtsam.NavState(estimate.atPose3(X(k)), estimate.atVector(V(k)))
             self._bias = estimate.atConstantBias(B(k))
-        except RuntimeError:  # the window has become singular: go on from the prediction
+        except RuntimeError:  # the window has become singular: continue from the prediction
             self._state = predicted
             self._restart(0.1, 1.0)
 
     def _refine(self, edges: F64, planes: F64, T_odom_imu: F64) -> None:
-        """Their section III.D: register to the map, without roll and pitch."""
+        """Register to the map, without roll and pitch (their section III.D)."""
         T = register(self._T_map_odom @ T_odom_imu, partial(self._map.pairs, edges, planes), ROUNDS, UPRIGHT).T
         self._T_map_odom = T @ lie.inverse(T_odom_imu)
         self._map.insert(lie.moved(T, edges), lie.moved(T, planes), T[:3, 3])
 
 
 def _in_body(fit: PoseFit) -> F64:
-    """The information (6, 6) of a fit for a perturbation in the moving frame, in the order of gtsam's Pose3."""
+    """The information (6, 6) of a fit for perturbations in the moving frame, in the order of gtsam's Pose3."""
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = fit.T[:3, :3]
     return np.asarray(turned.T @ fit.information @ turned)

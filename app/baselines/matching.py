@@ -1,7 +1,7 @@
-"""Lines and planes that feature points belong to, and the pose that brings the points onto them.
+"""Lines and planes to which feature points belong, and the pose that best fits the points to them.
 
-Both of LOAM's distances, of a point to a line and to a plane, are written as distances to planes: a line is where two
-planes at right angles meet. So one solver does for both, and for LIOM's factors.
+LOAM's distances of a point to a line and to a plane are both written as distances to planes: a line is the intersection
+of two perpendicular planes. So one solver serves both, and LIOM's factors.
 """
 
 from collections.abc import Callable
@@ -20,28 +20,28 @@ _Tree: Any = KDTree  # scipy ships no types
 
 NEIGHBOURS = 6
 REACH_M = 1.2
-"""Neighbours farther away do not belong to a point."""
+"""Points farther away do not count as neighbours."""
 LINE, PLANE = 5.0, 0.15
-"""The variance of neighbours along a line is at least this many times that across it; across a plane, at most that
-share of the others."""
+"""On a line, the neighbours' variance along it is at least this many times that across; on a plane, the variance across
+is at most this share of the others."""
 SPREAD = 0.02
-"""Least share of the variance along a plane's longer axis that the shorter one has: a scan line makes no plane."""
+"""Least ratio of the variances along a plane's shorter and longer axes: a single scan line does not form a plane."""
 THICK_M = 0.06
-"""RMS distance of neighbours from their line or plane above which they form none: three times a scanner's noise,
-so that hedges have no planes."""
+"""Largest RMS distance of neighbours from their line or plane: three times a scanner's noise, so that hedges form
+no planes."""
 HUBER_M = 0.1
 WEAK = 0.1
-"""A direction constrained by less than this share of a well-seen one keeps the prediction (Zhang, Kaess and Singh, "On
-Degeneracy of Optimization-based State Estimation Problems", ICRA 2016). Normals that are wrong by 0.2 rad seem to
-constrain unseen directions by a share of 0.04."""
+"""A direction constrained less than this share of a well-constrained one keeps the prediction (Zhang, Kaess and Singh,
+"On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016). Normals with errors of 0.2 rad seem to
+constrain unobserved directions by a share of 0.04."""
 _LINE_APART_M = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
     """Attributes:
-    points: (n, 3) m, in the moving frame. normals: (n, 3) unit and anchors: (n, 3) m, of the planes that they are
-        on, in the fixed frame.
+    points: (n, 3) m, in the moving frame. normals: (n, 3) unit and anchors: (n, 3) m, of the points' planes, in the
+        fixed frame.
     """
 
     points: F64
@@ -55,9 +55,9 @@ class Pairs:
 @dataclass(frozen=True, slots=True)
 class PoseFit:
     """Attributes:
-    T: (4, 4) T_fixed_moving. information: (6, 6) of it in units of one point's, rotation then translation in the
-        fixed frame; nothing of weak directions.
-    pairs: used.
+    T: (4, 4) T_fixed_moving. information: (6, 6), in units of the information of one point; rotation, then
+        translation, in the fixed frame; zero in weak directions.
+    pairs: number used.
     """
 
     T: F64
@@ -70,12 +70,12 @@ def joined(*parts: Pairs) -> Pairs:
 
 
 def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> PoseFit:
-    """Gauss-Newton steps from `T` with Huber's weights; directions that the pairs leave open stay as they are.
+    """Gauss-Newton steps from `T` with Huber weights; directions that the pairs do not constrain stay unchanged.
 
     A perturbation acts from the left, about the moving frame's origin: R <- exp(w) R, p <- p + v.
 
     Args:
-        free: (m, 6) orthonormal, the perturbations that are allowed; None: all.
+        free: (m, 6) orthonormal, the allowed perturbations; None: all.
     """
     free = np.eye(6) if free is None else free
     information = np.zeros((6, 6))
@@ -97,9 +97,9 @@ def solve(T: F64, pairs: Pairs, steps: int = 2, free: F64 | None = None) -> Pose
 
 
 def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64, F64]:
-    """The step (6,) within `free` and the information (6, 6), both without what the pairs do not determine.
+    """The step (6,) within `free` and the information (6, 6), both without unconstrained directions.
 
-    lever: m, by which rotations are made lengths, so that all directions can be compared.
+    lever: m, converts rotations to lengths, so that all directions can be compared.
     """
     basis = free / np.array([lever] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(basis @ information @ basis.T)
@@ -111,7 +111,7 @@ def _step(information: F64, gradient: F64, lever: float, free: F64) -> tuple[F64
 
 
 def register(T: F64, pairs: Callable[[F64], Pairs], rounds: int, free: F64 | None = None) -> PoseFit:
-    """Match and solve in turn from a good guess `T` on, at most `rounds` times. pairs: what lies together at a pose."""
+    """From a good guess `T`, match and solve in turn, at most `rounds` times. pairs: matches points at a pose."""
     for _ in range(rounds):
         fit = solve(T, pairs(T), free=free)
         change = lie.log_se3(lie.inverse(T) @ fit.T)
@@ -122,17 +122,17 @@ def register(T: F64, pairs: Callable[[F64], Pairs], rounds: int, free: F64 | Non
 
 
 class LastScan:
-    """Edges and planes of one scan, to match the next one with (section V.B)."""
+    """Edges and planes of one scan, to which the next scan is matched (section V.B)."""
 
     def __init__(self, edges: FeaturePoints, planes: FeaturePoints) -> None:
         self._edges, self._planes = _Lines(edges), _Lines(planes)
 
     def pairs(self, edges: FeaturePoints, planes: FeaturePoints, T: F64) -> Pairs:
-        """Of the features of the next scan that T_last_next brings near a line or a plane."""
+        """Pairs of the next scan's features that T_last_next places near a line or a plane."""
         return joined(self._on_edges(edges, T), self._on_planes(planes, T))
 
     def _on_edges(self, features: FeaturePoints, T: F64) -> Pairs:
-        """A line through the nearest edge point and the nearest one of a scan line beside it."""
+        """Lines through the nearest edge point and the nearest edge point on an adjacent scan line."""
         near, beside, _, found = self._edges.neighbours(lie.moved(T, features.points))
         along = beside - near
         length = np.linalg.norm(along, axis=1)
@@ -140,17 +140,17 @@ class LastScan:
         return _about_lines(features.points[found], near[found], along[found] / length[found, None])
 
     def _on_planes(self, features: FeaturePoints, T: F64) -> Pairs:
-        """A plane through the nearest point, one beside it on its scan line, and one of another scan line."""
+        """Planes through the nearest point, one beside it on its scan line, and one on another scan line."""
         near, beside, along, found = self._planes.neighbours(lie.moved(T, features.points))
         normals = np.cross(beside - near, along - near)
         lengths = np.linalg.norm(normals, axis=1)
         spans = np.linalg.norm(beside - near, axis=1) * np.linalg.norm(along - near, axis=1)
-        found &= lengths > 0.2 * spans + 1e-9  # no sliver
+        found &= lengths > 0.2 * spans + 1e-9  # the triangle must not be a sliver
         return Pairs(features.points[found], normals[found] / lengths[found, None], near[found])
 
 
 class _Lines:
-    """Points on scan lines. A fourth coordinate keeps the lines apart, so that one tree finds the nearest of a line."""
+    """Points on scan lines. A fourth coordinate separates the lines, so one tree finds the nearest on a given line."""
 
     def __init__(self, cloud: FeaturePoints) -> None:
         self._cloud = cloud
@@ -158,8 +158,8 @@ class _Lines:
         self._by_line = _Tree(self._apart(cloud.points, cloud.lines)) if len(cloud) else None
 
     def neighbours(self, points: F64) -> tuple[F64, F64, F64, np.ndarray]:
-        """(m, 3) nearest point, nearest of a line beside that one's, second nearest of its own line; (m,) where all
-        of that exists."""
+        """(m, 3) nearest point, nearest on an adjacent line, second nearest on its own line; (m,) mask where all three
+        exist."""
         nothing = np.zeros((len(points), 3))
         if self._tree is None or self._by_line is None or len(self._cloud) < 3 or not len(points):
             return nothing, nothing, nothing, np.zeros(len(points), np.bool_)
@@ -196,7 +196,7 @@ class FeatureMap:
         return sum(len(cloud) for cloud in self._clouds)
 
     def thinned(self, edges: F64, planes: F64) -> tuple[F64, F64]:
-        """One point for each voxel, as matching needs no more."""
+        """One point per voxel, which is enough for matching."""
         return tuple(  # type: ignore[return-value]
             self._grid.downsample(points.astype(np.float32), voxel).points.astype(np.float64)
             for points, voxel in zip((edges, planes), self._voxels, strict=True)
@@ -211,7 +211,7 @@ class FeatureMap:
             self._trees[index] = _Tree(self._clouds[index]) if len(self._clouds[index]) >= NEIGHBOURS else None
 
     def pairs(self, edges: F64, planes: F64, T: F64) -> Pairs:
-        """Of points (n, 3) that T_map_moving brings near a line or a plane of the map."""
+        """Pairs of points (n, 3) that T_map_moving places near a line or a plane of the map."""
         return joined(self._on_lines(edges, T), self._on_planes(planes, T))
 
     def _on_lines(self, points: F64, T: F64) -> Pairs:
@@ -226,7 +226,7 @@ class FeatureMap:
         return Pairs(points[found], vectors[found, :, 0], means[found])
 
     def _patches(self, index: int, points: F64, T: F64) -> tuple[F64, F64, F64, F64]:
-        """The points that have enough neighbours; mean, variances (m, 3) ascending and axes (m, 3, 3) of those."""
+        """Mask of the points with enough neighbours; of these, mean, variances (m, 3) ascending and axes (m, 3, 3)."""
         tree = self._trees[index]
         if tree is None or not len(points):
             return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3))
@@ -240,7 +240,7 @@ class FeatureMap:
 
 
 def _about_lines(points: F64, anchors: F64, directions: F64) -> Pairs:
-    """Two planes that meet in each line, through `anchors` (n, 3) along `directions` (n, 3)."""
+    """Two perpendicular planes for each line through `anchors` (n, 3) along `directions` (n, 3)."""
     across = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     normals = np.concatenate([across, np.cross(directions, across)])

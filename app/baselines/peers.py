@@ -1,6 +1,6 @@
-"""Odometries from PyPI as baselines, with their own defaults and the true mounting of the sensor.
+"""Odometry packages from PyPI as baselines, with their own defaults and the true mounting of the sensor.
 
-Each is imported only when it is made: `app.baselines.systems` puts its folder on the path first.
+Each package is imported only when needed: `app.baselines.systems` first adds its folder to the path.
 """
 
 from typing import Any
@@ -14,10 +14,10 @@ from app.slam.types import F64, I64, Measurement
 
 
 class _Icp:
-    """An odometry of the LiDAR alone, in a world that begins with it, as poses of the IMU in one whose z points up."""
+    """LiDAR-only odometry. Its poses start at the LiDAR; they are converted to IMU poses in a world with z up."""
 
     in_middle = False
-    """Whether its poses are those in the middle of scans, not at their ends."""
+    """Whether its poses refer to the middle of scans instead of their end."""
 
     def __init__(self, params: Params, odometry: Any) -> None:
         self._odometry, self._T_imu_lidar = odometry, mounting(params)
@@ -43,7 +43,7 @@ class KissIcp(_Icp):
 
         config = KISSConfig()
         config.data.max_range, config.data.min_range = params.sensor.max_range, params.sensor.min_range
-        config.mapping.voxel_size = config.data.max_range / 100.0  # its own rule
+        config.mapping.voxel_size = config.data.max_range / 100.0  # the package's own rule
         super().__init__(params, KissICP(config))
 
 
@@ -63,7 +63,7 @@ class GenzIcp(_Icp):
 
 
 class RkoLio:
-    """RKO-LIO: Malladi et al., 2025. Its poses are the IMU's at scan ends."""
+    """RKO-LIO: Malladi et al., 2025. Its poses are those of the IMU at the scans' ends."""
 
     def __init__(self, params: Params) -> None:
         from rko_lio.config import LIOConfig

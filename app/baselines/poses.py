@@ -1,4 +1,4 @@
-"""A baseline's LiDAR on the IMU, the begin of its world, and keyframes, so that its map can be compared with ours."""
+"""A baseline's mounting, its first pose, and its keyframes, so that its map can be compared with ours."""
 
 import numpy as np
 
@@ -13,19 +13,19 @@ Stamped = tuple[int, F64]
 
 
 def mounting(params: Params) -> F64:
-    """T_imu_lidar (4, 4), as the parameters say."""
+    """T_imu_lidar (4, 4), according to the parameters."""
     R = lie.from_rpy_degrees(params.sensor.rotation)
     return lie.transform(R, np.array(params.sensor.translation, np.float64))
 
 
 def levelled(samples: ImuSamples) -> F64:
-    """T_odom_imu (4, 4) of the first pose: at the origin, z against the gravity that the samples feel."""
+    """T_odom_imu (4, 4) of the first pose: at the origin, with z opposite to the gravity in the samples."""
     up = samples.accel.mean(axis=0) if len(samples) else np.array([0.0, 0.0, 1.0])
     return lie.transform(lie.between(up, np.array([0.0, 0.0, 1.0])), np.zeros(3))
 
 
 def keep_keyframe(store: KeyframeStore, scan: Scan, now: Stamped, last: Stamped | None, params: Params) -> None:
-    """Store the scan, undistorted by these poses, if the pose is far enough from that of the last keyframe."""
+    """Store the scan, undistorted with these poses, if its pose is far enough from the last keyframe's."""
     stamp_ns, T_odom_imu = now
     T_last = store[len(store) - 1].T_odom_imu if len(store) else None
     if not is_due(T_last, T_odom_imu, params.keyframe):

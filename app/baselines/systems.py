@@ -15,21 +15,21 @@ from app.slam.params import Params
 from app.slam.types import F64, Measurement
 
 FOLDER = Path(__file__).parents[2] / "build" / "peers"
-"""Where systems from PyPI are installed: a folder of their own, since some want other versions of shared packages."""
+"""Separate folder for systems from PyPI, since some need other versions of shared packages."""
 
 
 class Baseline(Protocol):
-    """An odometry. A new one is made for each recording and gets every measurement in order."""
+    """An odometry system. A new instance is made for each recording and gets every measurement in order."""
 
     def step(self, measurement: Measurement) -> tuple[int, F64]:
-        """Process a scan; returns a time in ns, of the scan's end if nothing else is said, and T_odom_imu (4, 4)."""
+        """Process a scan. Returns a time in ns, usually that of the scan's end, and T_odom_imu (4, 4) at that time."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class System:
     """Attributes:
-    title: column of the tables. meaning: in words. make: a new one. package: what pip installs; "" if it is here.
+    title: column of the tables. meaning: in words. make: makes an instance. package: for pip; "" if part of hemislam.
     """
 
     title: str
@@ -38,7 +38,7 @@ class System:
     package: str = ""
 
     def start(self, params: Params) -> Baseline:
-        """Ready for a recording. A package comes last on the path, so that hemislam's versions of shared ones win.
+        """Make an instance for a recording. Packages go last on the path, so hemislam's shared packages have priority.
 
         Raises:
             HemislamError: it is not installed.
@@ -49,7 +49,7 @@ class System:
         return self.make(params)
 
     def version(self) -> str:
-        """Of the installed package; "" for one that is part of hemislam.
+        """Version of the installed package; "" for a system that is part of hemislam.
 
         Raises:
             HemislamError: it is not installed.
@@ -79,7 +79,7 @@ def find_system(name: str) -> System:
     """The system of this name, installed.
 
     Raises:
-        HemislamError: there is none, or its package is missing.
+        HemislamError: there is no such system, or its package is missing.
     """
     if name not in SYSTEMS:
         raise HemislamError(f"There is no baseline `{name}`; choose from {', '.join(SYSTEMS)}.")

@@ -1,5 +1,5 @@
-"""Search for the parameters that fit a sensor and a place.
+"""Search for the parameters that suit a sensor and a place.
 
-`space` says what may vary, `objectives` what is wanted, `tune` searches, `report` writes the result; `process` does all
-of it for the page.
+`space` declares what may vary, `objectives` what to optimise; `tune` searches, `report` writes the result; `process`
+does all of this for the page.
 """

@@ -1,4 +1,4 @@
-"""What a search may look for. A new objective is one entry in `OBJECTIVES`."""
+"""The objectives of a search. A new objective is one entry in `OBJECTIVES`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from app.slam.errors import HemislamError
 from app.slam.metrics import RPE_OVER, GroundScore
 
-if TYPE_CHECKING:  # the page names objectives and needs nothing of evaluation
+if TYPE_CHECKING:  # the page only names objectives and does not need the evaluation
     from app.evaluation.evaluate import Subject
     from app.evaluation.measured import Outcome
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # the page names objectives and needs nothing of evaluation
 @dataclass(frozen=True, slots=True)
 class Objective:
     """Attributes:
-    of: its value for a finished run, None if it has none. greatest: whether more is better.
+    of: its value for a finished run; None if the run has none. greatest: whether a greater value is better.
     needs_truth: whether it is measured against a truth.
     """
 
@@ -58,7 +58,7 @@ OBJECTIVES: dict[str, Objective] = {
 
 
 def choose_objectives(names: Sequence[str], subjects: "Sequence[Subject]") -> tuple[Objective, ...]:
-    """Raises HemislamError: a name is unknown or twice there, or a recording has no truth for it."""
+    """Find objectives by name. Raises HemislamError: a name is unknown or repeated, or a recording lacks a truth."""
     chosen = []
     for name in names:
         objective = OBJECTIVES.get(name)
@@ -77,7 +77,7 @@ def choose_objectives(names: Sequence[str], subjects: "Sequence[Subject]") -> tu
 
 
 def score(objective: Objective, outcomes: "Sequence[Outcome]") -> float | None:
-    """The mean over recordings; None if one of them has no value."""
+    """The mean over all recordings; None if a recording has no value."""
     values = [objective.of(outcome) for outcome in outcomes]
     if any(value is None or not np.isfinite(value) for value in values):
         return None

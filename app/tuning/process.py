@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What is searched for.
+    """The request for a search.
 
     Attributes:
-        parameters: what varies, as `--parameters` has it. objectives: names. how: as `--search`.
+        parameters: those that vary, as in `--parameters`. objectives: names. how: as in `--search`.
         start_s, duration_s: the part of the recording; None: to its end.
-        folder: for the files that `hemislam tune` writes. marks: as `Job` has them.
+        folder: for the files that `hemislam tune` writes. marks: as in `Job`.
     """
 
     recording: Path
@@ -39,7 +39,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """runs: how many have ended. ran: whether the last one ran now, or was found finished, which takes no time."""
+    """A run has ended. runs: how many have. ran: False if the run had finished before, which takes no time now."""
 
     runs: int
     ran: bool
@@ -47,12 +47,12 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """What is known so far.
+    """The results so far.
 
     Attributes:
-        best: numbers of the trials that no other one beats.
-        importance: share of each parameter in the variation of the first objective.
-        held_back: trials run again on a part that the search has not seen. finished: no more will come.
+        best: numbers of the trials that no other trial beats.
+        importance: each parameter's share in the variation of the first objective.
+        held_back: trials run again on a part that the search has not seen. finished: whether the search has ended.
     """
 
     trials: tuple[Trial, ...] = ()
@@ -63,7 +63,7 @@ class Tried:
 
 
 def find(owner: Link, wanted: Wanted) -> None:
-    """Send an `Ended` after each run, a `Tried` after each batch of trials. Raises HemislamError if none can be run."""
+    """Send an `Ended` after each run, a `Tried` after each batch of trials. Raises HemislamError if nothing can run."""
     from app.evaluation.evaluate import Subject
     from app.evaluation.runner import run_jobs
     from app.evaluation.truth import read_truth
@@ -76,7 +76,7 @@ def find(owner: Link, wanted: Wanted) -> None:
     subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
     objectives = choose_objectives(wanted.objectives, [subject])
     part = Part(wanted.start_s, wanted.duration_s)
-    rest = part.next() if not wanted.marks else None  # marks are on the part itself
+    rest = part.next() if not wanted.marks else None  # only this part has marks
     search = SearchPlan(
         parse_dimensions(wanted.parameters), objectives, part, wanted.params, rest, wanted.how, wanted.trials
     )

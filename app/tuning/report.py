@@ -1,4 +1,4 @@
-"""What a search leaves: trials.csv, tuning.json, the proposed parameters as YAML, and tuning.html with its plots."""
+"""The files of a search: trials.csv, tuning.json, the proposed parameters as YAML, and tuning.html with its plots."""
 
 import json
 import warnings
@@ -31,8 +31,8 @@ def write_results(
     """Write all files, each whole or not at all.
 
     Args:
-        held_back: trials run again on the part held back; none if there is no such part.
-        inputs: what the search was asked for.
+        held_back: trials run again on the part held back; empty if there is no such part.
+        inputs: the request for the search.
 
     Raises:
         HemislamError: the folder cannot be written to.
@@ -56,12 +56,12 @@ def write_results(
         "tuning.html": _html(trials, best, held_back, objectives, study),
     }
     if proposed is not None:
-        texts[BEST] = yaml.safe_dump(nested(proposed.values), sort_keys=False)  # fits every recording
+        texts[BEST] = yaml.safe_dump(nested(proposed.values), sort_keys=False)  # applies to every recording
     write_texts(folder, texts)
 
 
 def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, Any]:
-    """Plotly figures by title, those that the trials so far allow: history, importance, parallel coordinates, front."""
+    """Plotly figures by title, as far as the trials allow: history, importance, parallel coordinates, Pareto front."""
     from optuna import visualization as draw
     from plotly.graph_objects import Bar, Figure  # type: ignore[import-untyped]
 
@@ -88,15 +88,15 @@ def pictures(study: optuna.Study, objectives: Sequence[Objective]) -> dict[str, 
 
 
 def importances(study: optuna.Study, index: int, objective: Objective) -> dict[str, float]:
-    """Share of each parameter in the variation of the objective with this index, largest first; none while unknown."""
+    """Each parameter's share in the variation of the objective with this index, largest first; empty while unknown."""
     from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
-    sign = -1.0 if objective.greatest else 1.0  # importance is for low values
+    sign = -1.0 if objective.greatest else 1.0  # importance is computed for low values
     done = [trial for trial in study.trials if trial.state == optuna.trial.TrialState.COMPLETE]
     if len({trial.values[index] for trial in done}) < 2 or len(done[0].params) < 2:
         return {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it reminds of what `sign` settles
+        warnings.simplefilter("ignore", UserWarning)  # it warns about a case that `sign` handles
         return get_param_importances(
             study, evaluator=PedAnovaImportanceEvaluator(), target=lambda trial: sign * float(trial.values[index])
         )

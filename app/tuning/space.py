@@ -1,4 +1,4 @@
-"""What a search may vary: parameters with their ranges, from their declaration or narrower ones from the user."""
+"""The search space: parameters with their declared ranges, or narrower ranges from the user."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,14 +13,14 @@ from app.slam.errors import HemislamError
 from app.slam.params import Leaf, Params, leaves
 
 WIDE = 50.0
-"""A range whose ends differ by more than this factor is searched by ratios, not by differences."""
+"""A range whose ends differ by more than this factor is searched on a logarithmic scale."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """One parameter that varies.
+    """A parameter that varies.
 
-    low, high: the ends of a number's range, multiples of the step for a whole number; unused for a switch or a choice.
+    low, high: the ends of a number's range; for a whole number, multiples of the step. Unused for a switch or a choice.
     """
 
     leaf: Leaf
@@ -45,21 +45,21 @@ class Dimension:
         return FloatDistribution(self.low, self.high)
 
     def holds(self, value: Any) -> bool:
-        """Whether the value lies in the range and, if it is a whole number, on the parameter's step."""
+        """Whether the value lies in the range and, for a whole number, is a multiple of the parameter's step."""
         distribution = self.distribution
         if isinstance(distribution, IntDistribution) and value % distribution.step:
             return False
         return isinstance(distribution, CategoricalDistribution) or self.low <= value <= self.high
 
     def rounded(self, value: Any) -> Any:
-        """The value on the parameter's own step, so that the same setting is never run twice."""
+        """The value rounded to the parameter's own step, so that the same setting never runs twice."""
         step = self.leaf.step
         if not isinstance(value, float) or not step:
             return value
         return min(max(float(f"{round(value / step) * step:.9g}"), self.low), self.high)
 
     def grid(self, points: int) -> list[Any]:
-        """At most `points` values, spread evenly over the range."""
+        """At most `points` values, evenly spaced over the range."""
         distribution = self.distribution
         if isinstance(distribution, CategoricalDistribution):
             return list(distribution.choices)
@@ -71,17 +71,17 @@ class Dimension:
 
 
 def parse_dimensions(text: str) -> tuple[Dimension, ...]:
-    """From `ground.alpha,ground.sigma=0.01:0.08`: names, each with a range of its own or the declared one.
+    """Parse names such as `ground.alpha,ground.sigma=0.01:0.08`, each with its own range or the declared one.
 
     Raises:
-        HemislamError: a name is unknown or twice there, a parameter is no number, switch or choice, or a range is none.
+        HemislamError: a name is unknown or repeated, a parameter cannot vary, or a range is invalid.
     """
     known = {leaf.path: leaf for leaf in leaves()}
     found: dict[str, Dimension] = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         path, equals, limits = part.partition("=")
         if path not in known:
-            Params().with_values({path: 0})  # raises, and names the parameters that are meant
+            Params().with_values({path: 0})  # raises, and suggests similar names
         if path in found:
             raise HemislamError(f"{path} is named twice; name it once.")
         found[path] = _dimension(known[path], limits if equals else None)
@@ -115,10 +115,10 @@ def _dimension(leaf: Leaf, limits: str | None) -> Dimension:
 
 
 def grid(dimensions: Sequence[Dimension], most: int) -> list[Mapping[str, Any]]:
-    """At most `most` settings on a grid, every number with the same count of values.
+    """At most `most` settings on a grid; every number has the same count of values.
 
     Raises:
-        HemislamError: there are more settings with two values each.
+        HemislamError: even with two values each, there are more settings.
     """
     least = math.prod(len(dimension.grid(2)) for dimension in dimensions)
     if least > most:

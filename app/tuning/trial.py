@@ -1,4 +1,4 @@
-"""Settings that were tried, and the best of them."""
+"""The settings tried, and the best of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ DEFAULTS = "as given"
 @dataclass(frozen=True, slots=True)
 class Trial:
     """Attributes:
-    values: by dotted name; none for the first one. scores: by objective, None if it has none. error: why it failed.
+    values: by dotted name; empty for the first trial. scores: by objective, None if missing. error: why it failed.
     """
 
     number: int
@@ -33,7 +33,7 @@ class Trial:
 
 
 def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Trial]:
-    """The trials that no other one beats in every objective, the best of the first objective first."""
+    """The Pareto front: trials that no other trial beats, sorted by the first objective, the best first."""
     signs = [-1.0 if objective.greatest else 1.0 for objective in objectives]
     costs = {
         trial.number: [sign * (value or 0.0) for sign, value in zip(signs, trial.scores, strict=True)]
@@ -54,14 +54,15 @@ def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Tria
 
 
 def beats(trial: Trial, other: Trial, objectives: Sequence[Objective]) -> bool:
-    """Whether it is better in an objective and worse in none."""
+    """Whether one trial is better than the other in some objective and worse in none."""
     return front((other, trial), objectives) == [trial]
 
 
 def proposal(trials: Sequence[Trial], held_back: Sequence[Trial], objectives: Sequence[Objective]) -> Trial | None:
     """The setting to use; None if no trial has a result.
 
-    On the part held back it must beat the parameters as given, or these stay. Without that part it is the best trial.
+    On the part held back, it must beat the given parameters; otherwise these stay. Without that part, it is the best
+    trial.
     """
     if not held_back:
         return next(iter(front(trials, objectives)), None)
@@ -71,7 +72,7 @@ def proposal(trials: Sequence[Trial], held_back: Sequence[Trial], objectives: Se
 
 
 def advice(trials: Sequence[Trial], held_back: Sequence[Trial], objectives: Sequence[Objective]) -> str:
-    """In a sentence, what was found on the part held back; "" without one."""
+    """The result on the part held back, in a sentence; "" if there is no such part."""
     best = proposal(trials, held_back, objectives)
     if not held_back or best is None:
         return ""

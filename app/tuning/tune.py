@@ -1,7 +1,7 @@
-"""What `hemislam tune` does: settings are tried on recordings, and the best of them once more on a part held back.
+"""The work of `hemislam tune`: try settings on recordings, then check the best of them on a part held back.
 
-Nothing but finished runs is kept. The same search asks for the same settings in the same order, whatever the number
-of processes, so one that was interrupted finds its finished runs and goes on where it was.
+Only finished runs are kept. The same search tries the same settings in the same order, whatever the number of
+processes. So an interrupted search finds its finished runs and continues from there.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,17 +24,17 @@ from app.tuning.space import Dimension, grid
 from app.tuning.trial import SearchMethod, Trial, beats, front
 
 BATCH = 8
-"""Trials between two looks at the results; the same for any number of processes, so that trials repeat."""
+"""Trials chosen at a time; the same for any number of processes, so that searches can be repeated."""
 MOST_CHECKED = 5
-"""Settings that are run again on the part held back, at most."""
+"""At most this many settings are run again on the part held back."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Of each recording, in seconds after its first scan.
+    """A part of each recording, in seconds after its first scan.
 
     Attributes:
-        duration_s: None for all the rest. lead_s: as `Job` has it.
+        duration_s: None: to the end. lead_s: as in `Job`.
     """
 
     start_s: float = 0.0
@@ -42,10 +42,10 @@ class Part:
     lead_s: float = LEAD_S
 
     def next(self, duration_s: float | None = None) -> "Part | None":
-        """The part right after it, as long if nothing else is said; None if it goes to the end.
+        """The part that follows, by default with the same length; None if this part reaches the end.
 
-        Reading begins where it begins for this part: a start just before the next one may fall on a place where the
-        scanner sees too little to find its speed, and all settings would then be lost alike.
+        Reading begins at the same time as for this part: just before the next part, the scanner may see too little to
+        estimate its speed, and then all settings would fail alike.
         """
         if self.duration_s is None:
             return None
@@ -54,11 +54,11 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class SearchPlan:
-    """What is tried.
+    """The plan of a search.
 
     Attributes:
-        given: the parameters as given, of the first recording; the search learns from them as from any trial.
-        rest: a part held back, on which the best are checked. trials: settings besides the parameters as given.
+        given: the given parameters of the first recording; the search learns from them as from any trial.
+        rest: a part held back, on which the best settings are checked. trials: number of settings besides `given`.
     """
 
     dimensions: Sequence[Dimension]
@@ -75,7 +75,7 @@ class Runs:
     """Runs settings on all recordings and scores them.
 
     Args:
-        folder: of the search; finished runs beside it are found again. run: as `evaluate`. start_s: of the part.
+        folder: of the search; finished runs beside it are reused. run: as in `evaluate`. start_s: of the part.
 
     Raises:
         HemislamError: a recording cannot be used, or ends before the part.
@@ -94,7 +94,7 @@ class Runs:
         self.hashes = [check_subject(subject, start_s) for subject in subjects]
 
     def asked(self, wanted: SearchPlan) -> dict[str, Any]:
-        """What a search was asked for, as its report keeps it."""
+        """The request for a search, as kept in its report."""
         return {
             "recordings": [
                 {"path": str(one.recording), "sha256": sha256, "parameters": one.params.model_dump(mode="json")}
@@ -107,7 +107,7 @@ class Runs:
         }
 
     def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
-        """For each setting its scores by objective, and why it failed ("" if it did not)."""
+        """The scores of each setting by objective, and why it failed ("" if it did not)."""
         jobs = [[self._job(index, setting, part) for index in range(len(self._subjects))] for setting in settings]
         each = {job.folder: job for of_setting in jobs for job in of_setting}
         errors = self._run(list(each.values()))
@@ -143,7 +143,7 @@ class Runs:
 
 
 def parallel_runs(objectives: Sequence[Objective]) -> int:
-    """How many runs go on at once: one for each core, but one alone where its time is wanted."""
+    """Number of parallel runs: one per core, or a single one if an objective needs its time."""
     return 1 if any(one.name == "frame-time" for one in objectives) else cores()
 
 
@@ -152,16 +152,16 @@ OnTrials = Callable[[Sequence[Trial], optuna.Study], None]
 
 
 def tune(runs: Runs, wanted: SearchPlan, folder: Path, progress: OnTrials) -> tuple[list[Trial], tuple[Trial, ...]]:
-    """Search, check the best on the part held back, and write the files that `write_results` names into `folder`.
+    """Search, check the best settings on the part held back, and write the files of `write_results` into `folder`.
 
     Returns:
-        All trials, and those of them that were run again on the part held back.
+        All trials, and those that were run again on the part held back.
 
     Raises:
         HemislamError: a grid has more points than trials, or the folder cannot be written to.
     """
     if wanted.how == "grid":
-        grid(wanted.dimensions, wanted.trials)  # refused before anything runs
+        grid(wanted.dimensions, wanted.trials)  # fails before anything runs
     make_folder(folder / "runs")
     done, study = search(runs, wanted, progress)
     checked = check(runs, done, wanted.objectives, wanted.rest)
@@ -172,7 +172,7 @@ def tune(runs: Runs, wanted: SearchPlan, folder: Path, progress: OnTrials) -> tu
 def search(
     runs: Runs, wanted: SearchPlan, progress: OnTrials = lambda so_far, study: None
 ) -> tuple[list[Trial], optuna.Study]:
-    """Try the parameters as given and then the settings. Raises HemislamError as `tune` does for a grid."""
+    """Try the given parameters and then the settings. Raises HemislamError as `tune` does for a grid."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in wanted.objectives])
     ((scores, error),) = runs.score([{}], wanted.part)
@@ -201,11 +201,11 @@ def search(
 
 
 def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], rest: Part | None) -> tuple[Trial, ...]:
-    """The parameters as given and the best settings, on a part that the search has not seen; nothing without either."""
+    """The given parameters and the best settings, run on the part held back; empty without such a part or results."""
     if rest is None or not any(trial.complete for trial in trials):
         return ()
     best = [trial for trial in front(trials, objectives) if trial.number]
-    best.sort(key=lambda trial: not beats(trial, trials[0], objectives))  # those first that give nothing up
+    best.sort(key=lambda trial: not beats(trial, trials[0], objectives))  # those worse in no objective first
     chosen = [trials[0], *best[:MOST_CHECKED]]
     results = runs.score([trial.values for trial in chosen], rest)
     return tuple(
