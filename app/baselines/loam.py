@@ -2,8 +2,8 @@
 
 Written from Zhang and Singh, "LOAM: Lidar Odometry and Mapping in Real-time", RSS 2014. A scan is undistorted with the
 motion before it. The paper solves for motion and distortion together, which oscillates if the scanner sees a wall only
-early in each revolution. Single scan-to-scan steps also oscillate if azimuth steps are large: by 0.1 m at rest outdoors.
-Therefore the speed is the mean of several steps in the map, to which every scan is registered.
+early in each revolution. Single scan-to-scan steps also oscillate if azimuth steps are large: by 0.1 m at rest
+outdoors. Therefore the speed is the mean of several steps in the map, to which every scan is registered.
 """
 
 from functools import partial

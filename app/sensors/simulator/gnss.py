@@ -16,14 +16,14 @@ from app.slam.user_text import read_numbers
 
 @dataclass(frozen=True, slots=True)
 class Gnss:
-    """The receiver and where the scene lies.
+    """The receiver, and the scene's position on Earth.
 
     Attributes:
-        rate: fixes a second. noise: m, spread on each axis. offset: s by which its stamps are late.
-        outliers: share of fixes that are off by `wild` m, in a random direction.
+        rate: fixes per second. noise: m, standard deviation on each axis. offset: s by which its stamps are late.
+        outliers: share of fixes that are off by `wild` m in a random direction.
         x, y, z: m, lever arm from the IMU to the antenna, IMU frame.
-        latitude, longitude, height: degrees and m, of the scene's origin. heading: deg by which the scene's x axis is
-            turned from east towards north.
+        latitude, longitude, height: degrees and m, of the scene's origin. heading: deg, rotation of the scene's x axis
+            from east towards north.
     """
 
     rate: float = 5.0
@@ -40,7 +40,7 @@ class Gnss:
     heading: float = 30.0
 
     def with_sizes(self, assignments: Sequence[str]) -> "Gnss":
-        """With other values, each given as `name=value`. Raises HemislamError, which names them."""
+        """A receiver with other values, each given as `name=value`. Raises HemislamError, which names valid values."""
         made = replace(self, **read_numbers(assignments, self.__slots__))
         shares = 0.1 <= made.rate <= 50 and made.noise > 0 and 0 <= made.outliers <= 1
         if not (shares and abs(made.latitude) <= 84 and abs(made.offset) <= 3600):
@@ -52,7 +52,7 @@ class Gnss:
 
     @property
     def reference(self) -> GeoReference:
-        """Where the scene truly lies, in its UTM zone."""
+        """The true georeference of the scene, in its UTM zone."""
         grid = crs.utm(self.latitude, self.longitude)
         east, north = crs.transformer(crs.WGS84, grid).transform(self.longitude, self.latitude)
         rows = lie.from_rpy_degrees((0.0, 0.0, self.heading)).tolist()
@@ -64,7 +64,7 @@ class Gnss:
 def received(
     gnss: Gnss, trajectory: SmoothTrajectory, duration_s: float, start_ns: int, rng: np.random.Generator
 ) -> Fixes:
-    """The fixes that the receiver reports during a walk, with their covariances."""
+    """The fixes that the receiver reports during a walk, with covariances."""
     times = np.arange(0.5 / gnss.rate, duration_s, 1.0 / gnss.rate)
     places, rotations = trajectory.poses(times)
     places = places + rotations @ np.array([gnss.x, gnss.y, gnss.z]) + gnss.noise * rng.normal(size=places.shape)

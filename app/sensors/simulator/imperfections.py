@@ -1,6 +1,6 @@
-"""Imperfections of a real scanner, hand and surroundings for a simulated walk. All of them are off by default.
+"""Imperfections of a real scanner, hand and surroundings for a simulated walk. All are off by default.
 
-Each term is one field of `Imperfections`: its size, 0 where it is off. `IMPERFECT` has the sizes of real devices.
+Each term is one field of `Imperfections` that holds its size; 0 is off. `IMPERFECT` has the sizes of real devices.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from app.slam.types import F64, ImuSamples
 from app.slam.user_text import read_numbers
 
 GLASS_REFLECTIVITY = 0.05
-"""A surface that reflects less than this is a pane."""
+"""A surface with a lower reflectivity is glass."""
 PANE_M = 0.1
 JUMP_M = 0.15
 VIBRATION_HZ = (25.0, 70.0)
@@ -27,22 +27,22 @@ MOST_LATE_S = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """The size of each term; spreads are standard deviations. Sources in brackets.
+    """The size of each term; a spread is a standard deviation. Sources are in brackets.
 
     Attributes:
-        elevation: deg, spread of each channel's elevation [a unit's calibration table, 0.01 deg steps, ages].
-        range_bias: m, spread of each channel's distance [data sheet: +-3 cm].
-        incidence_bias: m too far at grazing incidence [the echo is stretched; reports of calibrations].
-        range_noise: m, spread of a distance in all; 0: the clean 5 mm [data sheet: +-3 cm].
-        mixed: share of firings beside a jump of over JUMP_M that land in between [the beam's footprint].
-        glass: share of beams that pass a pane and return from behind it.
-        mount_rotation, mount_translation: deg, m, by which the mounting differs from what is written, in a random
+        elevation: deg, spread of the channels' elevations [a unit's calibration table has 0.01 deg steps and ages].
+        range_bias: m, spread of the channels' range biases [data sheet: +-3 cm].
+        incidence_bias: m, excess range at grazing incidence [the echo is stretched; reports of calibrations].
+        range_noise: m, total spread of a range; 0: 5 mm, as for a clean scanner [data sheet: +-3 cm].
+        mixed: share of firings beside a range jump of over JUMP_M that return from in between [the beam's footprint].
+        glass: share of beams that pass through glass and return from behind it.
+        mount_rotation, mount_translation: deg, m, difference of the true from the written mounting, in a random
             direction [drawings and hand-eye calibrations].
-        gyro_scale, accel_scale: shares; misalignment: deg. Spreads for each axis [data sheets of MEMS IMUs].
+        gyro_scale, accel_scale: relative; misalignment: deg. Spreads per axis [data sheets of MEMS IMUs].
         gyro_vibration, accel_vibration: rad/s, m/s², amplitude at VIBRATION_HZ [the LiDAR's motor].
-        lost: share of IMU samples that are missing. jitter: s, spread of their stamps. late: s by which the IMU's
-            clock is late [USB and serial links].
-        companions: people ahead of, behind and in front of the operator, 1-3 m away; at most 3.
+        lost: share of IMU samples that are missing. jitter: s, spread of their stamps. late: s, delay of the IMU's
+            stamps [USB and serial links].
+        companions: number of people who walk ahead of, behind and across the operator, 1-3 m away; at most 3.
         hand: factor on the usual motion of the hand; 0 counts as 1.
     """
 
@@ -66,7 +66,7 @@ class Imperfections:
     hand: float = 0.0
 
     def with_sizes(self, assignments: Sequence[str]) -> "Imperfections":
-        """With other sizes, each given as `name=size`. Raises HemislamError, which names the terms."""
+        """Imperfections with other sizes, each given as `name=size`. Raises HemislamError, which names the terms."""
         made = replace(self, **read_numbers(assignments, self.__slots__, least=0.0))
         if max(made.late, made.jitter) > MOST_LATE_S:
             raise HemislamError("A simulated IMU's stamps cannot be late, or vary, by more than an hour (3600 s).")
@@ -97,7 +97,7 @@ IMPERFECT = Imperfections(
 
 
 class Unit:
-    """One scanner with its own errors, the same in every scan; its firings cycle through `channels`."""
+    """A scanner with its own errors, which are the same in every scan; its firings cycle through `channels`."""
 
     def __init__(self, sizes: Imperfections, rng: np.random.Generator, channels: int = CHANNELS) -> None:
         self.sizes, self._channels = sizes, channels
@@ -112,11 +112,11 @@ class Unit:
 
     @property
     def mounting(self) -> F64:
-        """(4, 4) T_nominal_lidar: where the scanner truly sits, in the frame in which it should."""
+        """(4, 4) T_nominal_lidar: the scanner's true pose in the frame of its nominal mounting."""
         return transform(self._turn, self._shift)
 
     def fired(self, directions: F64, levers: F64) -> tuple[F64, F64]:
-        """Where the firings really go, in the frame of the written mounting; both (n, 3)."""
+        """The true directions and levers of the firings in the frame of the written mounting, (n, 3) each."""
         level = directions[:, :2]
         flat = np.linalg.norm(level, axis=1)
         elevation = np.arctan2(directions[:, 2], flat) + np.resize(self._elevation, len(flat))
@@ -126,7 +126,7 @@ class Unit:
     def see_through(
         self, hits: Hits, scene: Raycaster, origins: F64, directions: F64, times: F64, rng: np.random.Generator
     ) -> None:
-        """Let beams pass panes: they return from what is behind. `hits` is changed in place."""
+        """Let beams pass through glass and return from behind it. `hits` is changed in place."""
         pane = (hits.reflectivity < GLASS_REFLECTIVITY) & np.isfinite(hits.distance)
         through = np.flatnonzero(pane & (rng.random(len(pane)) < self.sizes.glass))
         if not len(through):
@@ -140,7 +140,7 @@ class Unit:
             getattr(hits, name)[through] = getattr(behind, name)
 
     def ranges(self, hits: Hits, rng: np.random.Generator) -> F64:
-        """(n,) m, distances with their systematic errors and mixed pixels, without noise; n as the pattern's."""
+        """(n,) m, ranges with systematic errors and mixed pixels, without noise; n firings as in the pattern."""
         distance = hits.distance + self.sizes.incidence_bias * (1.0 - hits.incidence)
         turns = distance.reshape(-1, self._channels) + self._range_bias
         mixed = turns.copy()
@@ -152,7 +152,7 @@ class Unit:
         return mixed.ravel()
 
     def felt(self, imu: ImuSamples, start_ns: int, rng: np.random.Generator) -> ImuSamples:
-        """The samples that this IMU reports in place of a perfect IMU's."""
+        """The samples of this IMU, from those of a perfect IMU."""
         sizes, t = self.sizes, seconds(imu.stamps_ns - start_ns)
         frequencies, phases = self._hum
         hum = np.sin(2 * np.pi * t[:, None, None] * frequencies + phases)
@@ -166,7 +166,7 @@ class Unit:
 
 
 def livelier(walker: Walker, times: float) -> Walker:
-    """The same walker with a hand that moves `hand` times as much; 0 counts as 1."""
+    """The same walker with a hand that moves `times` as much; 0 counts as 1."""
     moved = {name: getattr(walker, name) * (times or 1.0) for name in ("bob", "sway", "pitch", "roll", "yaw")}
     return replace(walker, **moved)
 
@@ -174,7 +174,7 @@ def livelier(walker: Walker, times: float) -> Walker:
 def companions(
     number: float, trajectory: SmoothTrajectory, place: SimulatedScene, rng: np.random.Generator
 ) -> tuple[Mover, ...]:
-    """People who go with the operator: one ahead, one behind, one who crosses in front, 1-3 m away."""
+    """People who walk with the operator: one ahead, one behind, one who crosses in front, 1-3 m away."""
     climbs = place.path.shape[1] == 3
     swing, phase = rng.uniform(0.3, 0.7, (3, 2)), rng.uniform(0, 2 * np.pi, (3, 2))
 
@@ -202,5 +202,5 @@ def _direction(rng: np.random.Generator) -> F64:
 
 
 def _matrix(scale: float, skew: float, rng: np.random.Generator) -> F64:
-    """The matrix that maps a true vector to an IMU's axes: scale errors on the diagonal, misalignment beside it."""
+    """Matrix that maps a true vector to an IMU's axes: scale errors on the diagonal, misalignment off the diagonal."""
     return np.asarray(np.eye(3) + np.where(np.eye(3) > 0, scale, skew) * rng.normal(size=(3, 3)))

@@ -1,4 +1,4 @@
-"""A simulated LiDAR: each of its firings has its own time, direction, origin and pose."""
+"""A simulated LiDAR: each firing has its own time, direction, origin and pose."""
 
 from dataclasses import dataclass, field, replace
 
@@ -20,21 +20,21 @@ from app.sensors.simulator.trajectory import SmoothTrajectory, seconds
 from app.slam.types import F32, F64, I64, U16, Scan
 
 P_IMU_LIDAR: F64 = np.array([0.0175, 0.0276, -0.1083])
-"""m, the LiDAR's place on H2LID's IMU; their axes agree."""
+"""m, position of the LiDAR on H2LID's IMU; their axes are parallel."""
 
 STRAY_LOSS = 0.005
-"""Share of firings without a return, whatever they hit."""
+"""Share of firings without a return, independent of the surface."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """The firings of one scan, block by block; all b blocks have the same number of firings, n in all.
+    """The firings of one scan, block by block; all b blocks have equally many firings, n in total.
 
     Attributes:
         offsets_ns: (n,) time after the scan's start.
         directions, levers: (n, 3) in the LiDAR frame: a point is lever + distance * direction.
-        ring: (n,). blocks_ns: (b,) time of each block. block_ns: a block's duration.
-        channels: lasers, which fire one after the other.
+        ring: (n,). blocks_ns: (b,) time of each block. block_ns: duration of a block.
+        channels: number of lasers, which fire one after another.
     """
 
     offsets_ns: I64
@@ -47,7 +47,7 @@ class Pattern:
 
 
 def firing_pattern(model: Model = BPEARL, rate_hz: int = 10, every_block: int = 1) -> Pattern:
-    """The pattern of an RS-Bpearl, whose levers have their block's azimuth; only every k-th block fires."""
+    """The pattern of an RS-Bpearl, whose levers have the azimuth of their block; only every k-th block fires."""
     elevation, still = np.deg2rad(model.elevations_deg), np.zeros(model.channels)
     pattern = turning(elevation, still, model.firing_offsets_ns, model.block_ns, rate_hz, every_block)
     azimuth = np.repeat(2 * np.pi * rate_hz * 1e-9 * pattern.blocks_ns, model.channels)
@@ -58,9 +58,9 @@ def turning(
     elevation: F64, azimuth: F64, firing_ns: I64, block_ns: int, rate_hz: int, every_block: int,
     radial: float = 0.0, height: float = 0.0,
 ) -> Pattern:  # fmt: skip
-    """A head that turns from azimuth 0 at the scan's start, from x towards -y; only every k-th block fires.
+    """The pattern of a head that rotates from azimuth 0 at the scan's start, x towards -y; every k-th block fires.
 
-    elevation, azimuth: (c,) rad by channel, azimuth beside the head's. firing_ns: (c,) time within a block.
+    elevation, azimuth: (c,) rad by channel; azimuth relative to the head. firing_ns: (c,) time within a block.
     radial, height: m, lever of the lasers.
     """
     blocks_ns = np.arange(0, 1_000_000_000 // rate_hz // block_ns, every_block, dtype=np.int64) * block_ns
@@ -77,10 +77,10 @@ def turning(
 class Lidar:
     """Attributes:
     R_imu_lidar, p_imu_lidar: its mounting, p in m.
-    farthest: m, the longest distance. rated: (m, reflectivity) at which half of the beams return.
-    range_noise: m, spread of a distance before it is rounded to `range_step` (m, 0 = not rounded).
-    coordinate_step: m, rounding of x, y, z (0 = none). lossless: whether every beam that hits returns.
-    unit: the errors of one scanner; None: it has none.
+    farthest: m, longest range. rated: (m, reflectivity) at which half of the beams return.
+    range_noise: m, spread of a range before rounding to `range_step` (m, 0 = not rounded).
+    coordinate_step: m, rounding of x, y, z (0 = none). lossless: whether every beam that hits something returns.
+    unit: errors of this scanner; None: no errors.
     """
 
     R_imu_lidar: F64 = field(default_factory=lambda: np.eye(3))
@@ -104,7 +104,7 @@ class Lidar:
     ) -> Scan:
         """The firings of one revolution that starts `start_s` after `epoch_ns` (the trajectory's time 0).
 
-        The points come in firing order; the intensity is a whole number, the truth of the ground is given.
+        The points are in firing order; intensities are whole numbers, and the true ground labels are included.
         """
         start_ns = round(start_s * 1e9)
         origins, directions = self._rays(pattern, trajectory, start_ns)
@@ -142,10 +142,10 @@ class Lidar:
         )
 
     def _rays(self, pattern: Pattern, trajectory: SmoothTrajectory, start_ns: int) -> tuple[F64, F64]:
-        """Every firing's ray in the world, from the pose at its own time.
+        """The ray of every firing in the world, from the pose at its own time.
 
-        Poses are computed at both ends of each block and interpolated between: within 55 us a hand's motion deviates
-        from a straight line by nanometres.
+        Poses are computed at both ends of each block and interpolated in between: within 55 us, the motion of a hand
+        deviates from a straight line by nanometres.
         """
         if self.unit is not None:
             directions, levers = self.unit.fired(pattern.directions, pattern.levers)
@@ -170,7 +170,7 @@ class Lidar:
 
 
 def _detection(distance: F64, incidence: F32, reflectivity: F32, rated: tuple[float, float]) -> F64:
-    """Chance of a return: the echo, reflectivity * cos(incidence) / distance^2, against the data sheet's limit."""
+    """Probability of a return: the echo, reflectivity * cos(incidence) / distance^2, relative to the rated limit."""
     with np.errstate(divide="ignore"):
         echo = reflectivity * incidence / np.maximum(distance, MIN_RANGE_M) ** 2
         margin = np.log(echo * (rated[0] ** 2 / rated[1]))

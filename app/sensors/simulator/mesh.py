@@ -1,4 +1,4 @@
-"""Triangle meshes with the properties that a laser sees, and the solids from which scenes are built.
+"""Triangle meshes with the surface properties that matter to a laser, and the solids from which scenes are built.
 
 World frame: x, y level, z up, metres.
 """
@@ -39,7 +39,7 @@ class Mesh:
 
 
 class MeshBuilder:
-    """Collects solids; `build` returns the mesh. Angles in radians, yaw about +z."""
+    """Collects solids; `build` returns the mesh. Angles are in radians, yaw is about +z."""
 
     def __init__(self) -> None:
         self._vertices: list[F64] = []
@@ -51,7 +51,7 @@ class MeshBuilder:
     def add(
         self, vertices: F64, faces: npt.NDArray[np.integer], reflectivity: float | F32, ground: bool = False
     ) -> None:
-        """Any triangles: vertices (v, 3), faces (f, 3) into them; reflectivity for all or for each face."""
+        """Any triangles: vertices (v, 3), faces (f, 3) of vertex indices; reflectivity for all or for each face."""
         self._vertices.append(np.asarray(vertices, np.float64))
         self._faces.append((faces + self._count).astype(np.int32))
         self._reflectivity.append(np.broadcast_to(np.float32(reflectivity), len(faces)).astype(np.float32))
@@ -67,17 +67,17 @@ class MeshBuilder:
         )
 
     def place(self, mesh: Mesh, at: Triple) -> None:
-        """A finished mesh, moved but not turned."""
+        """A finished mesh, moved but not rotated."""
         for ground in (0, 1):
             which = mesh.ground == ground
             self.add(mesh.vertices + np.asarray(at), mesh.faces[which], mesh.reflectivity[which], bool(ground))
 
     def quad(self, corners: Sequence[Sequence[float]], reflectivity: float, ground: bool = False) -> None:
-        """Four corners in order around."""
+        """A quadrilateral: four corners in order around it."""
         self.add(np.array(corners, np.float64), np.array([[0, 1, 2], [0, 2, 3]]), reflectivity, ground)
 
     def box(self, centre: Triple, size: Triple, reflectivity: float, yaw: float = 0.0, tilt: float = 0.0) -> None:
-        """A closed box; `tilt` leans it about its own x axis before the yaw."""
+        """A closed box; `tilt` rotates it about its own x axis before the yaw."""
         c, s = np.cos(tilt), np.sin(tilt)
         corners = (_BOX_CORNERS * np.asarray(size)) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T
         self.add(_turned(corners, yaw) + np.asarray(centre), _BOX_FACES, reflectivity)
@@ -152,11 +152,11 @@ class MeshBuilder:
         thickness: float = 0.15,
         base: float = 0.0,
     ) -> None:
-        """An upright wall along a line in plan, with rectangular openings.
+        """An upright wall along a line in plan view, with rectangular openings.
 
         Args:
             start, end: (x, y) of the wall's middle line.
-            openings: (from, to, bottom, top) each: metres along the wall and above its base.
+            openings: (from, to, bottom, top), each in metres along the wall and above its base.
         """
         a, along, length, yaw = line_through(start, end)
 
@@ -175,14 +175,14 @@ class MeshBuilder:
 
 
 def band_faces(count: int) -> Faces:
-    """The faces between a ring of `count` vertices and an equal ring of the vertices that follow."""
+    """The faces between a ring of `count` vertices and an equal ring of the following vertices."""
     i = np.arange(count, dtype=np.int32)
     j = (i + 1) % count
     return np.vstack([np.column_stack([i, j, j + count]), np.column_stack([i, j + count, i + count])])
 
 
 def line_through(start: Triple, end: Triple) -> tuple[F64, F64, float, float]:
-    """Of a line in plan: its start, its unit direction, its length and its yaw."""
+    """Start, unit direction, length and yaw of a line in plan view."""
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
     length = float(np.linalg.norm(b - a))
     along = (b - a) / length

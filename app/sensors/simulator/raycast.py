@@ -1,4 +1,4 @@
-"""What a laser beam hits: the static part of a scene and the bodies that move through it."""
+"""Laser beams that hit the static part of a scene and the bodies that move through it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -28,9 +28,9 @@ class Mover:
 @dataclass(frozen=True, slots=True)
 class SimulatedScene:
     """Attributes:
-    mesh: everything static, world frame. movers: bodies that move.
-    path: (n, 2) waypoints of the trajectory in plan, m, or (n, 3) with the floor's z there.
-    closed: whether it is repeated lap by lap. height: the ground's z at (n, 2) points; None is z = 0, or the path's.
+    mesh: everything static, world frame. movers: moving bodies.
+    path: (n, 2) waypoints of the trajectory in plan view, m, or (n, 3) with the floor's z at each.
+    closed: whether it is repeated lap by lap. height: z of the ground at (n, 2) points; None: 0, or the path's z.
     """
 
     mesh: Mesh
@@ -42,10 +42,10 @@ class SimulatedScene:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """What each of n rays hit. Rays that hit nothing have infinite distance.
+    """The surfaces hit by n rays. Rays that hit nothing have infinite distance.
 
     Attributes:
-        distance: (n,) m. incidence: (n,) cosine of the angle to the surface's normal, 0-1.
+        distance: (n,) m. incidence: (n,) cosine of the angle to the surface normal, 0-1.
         reflectivity: (n,) 0-1. ground: (n,) 1 = floor or terrain.
     """
 
@@ -59,12 +59,12 @@ class Raycaster:
     """Casts rays at a scene, each at its own time."""
 
     def __init__(self, mesh: Mesh, movers: tuple[Mover, ...] = ()) -> None:
-        """Raises HemislamError, naming the system packages, where open3d cannot be loaded."""
+        """Raises HemislamError, which names the system packages, if open3d cannot be loaded."""
         self._still = _Target(mesh)
         self._movers = [(mover, _Target(mover.mesh), *_sphere(mover.mesh)) for mover in movers]
 
     def cast(self, origins: F64, directions: F64, times: F64) -> Hits:
-        """Rays (n, 3) + s * unit (n, 3) in the world frame, fired at times (n,) s."""
+        """Cast rays (n, 3) + s * unit (n, 3) in the world frame, fired at times (n,) s."""
         hits = self._still.cast(origins, directions)
         for mover, target, centre, radius in self._movers:
             where, _ = mover.pose(times[[0, -1]])
@@ -83,7 +83,7 @@ class Raycaster:
 
 
 class _Target:
-    """One mesh in open3d's ray casting scene."""
+    """A mesh in open3d's ray casting scene."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._open3d = _open3d()
@@ -115,19 +115,19 @@ def _open3d() -> Any:
 
 
 def _sphere(mesh: Mesh) -> tuple[float, float]:
-    """Height of the centre and radius of an upright body's bounding sphere about its own axis."""
+    """Centre height and radius of a bounding sphere centred on the axis of an upright body."""
     centre = float(mesh.vertices[:, 2].min() + mesh.vertices[:, 2].max()) / 2
     return centre, float(np.linalg.norm(mesh.vertices - np.array([0.0, 0.0, centre]), axis=1).max()) + 0.01
 
 
 def _passes(directions: F64, centre: F64, radius: float) -> npt.NDArray[np.bool_]:
-    """Which rays from the origin along unit `directions` come within `radius` of `centre`."""
+    """Mask of the rays from the origin along unit `directions` that come within `radius` of `centre`."""
     along = np.maximum(directions @ centre, 0.0)
     return np.asarray(centre @ centre - along**2 < radius**2)
 
 
 def _unturned(vectors: F64, yaw: F64) -> F64:
-    """Vectors (n, 3) in the frame that is turned by `yaw` (n,) about z."""
+    """Vectors (n, 3) in the frame rotated by `yaw` (n,) about z."""
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = vectors.T
     return np.column_stack([c * x + s * y, c * y - s * x, z])

@@ -1,4 +1,4 @@
-"""The scanners that can be simulated: one entry in `SCANNERS` and one function that makes their firings."""
+"""The scanners that can be simulated. Each has one entry in `SCANNERS` and one function that makes its firings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ _RATE_HZ = 10
 _RING_DEG = 2.0
 _MID360_RATE_HZ = 200_000
 _MID360_BLOCK = 20
-"""Firings within which the motion is taken as straight: 0.1 ms."""
+"""Number of firings within which the motion counts as straight: 0.1 ms."""
 _MID360_LASERS = 4
 
 
@@ -32,10 +32,10 @@ class Scanner:
     """A LiDAR with its IMU, and how its driver writes both.
 
     Attributes:
-        patterns: (rate in Hz, fire every k-th block, folder with the maker's tables) -> its firings.
-        upright: held with the LiDAR's z up and its x forward; otherwise its z looks forward and its x down.
-        lidar: its mounting, range and noise. rates_hz: at which it can turn.
-        layout: of its recordings. accel_unit: m/s² that its driver calls 1.
+        patterns: (rate in Hz, fire every k-th block, folder with the maker's tables) -> firings of its scans.
+        upright: held with the LiDAR's z up and its x forward; otherwise with its z forward and its x down.
+        lidar: its mounting, range and noise. rates_hz: its possible scan rates.
+        layout: of its recordings. accel_unit: m/s² per unit of acceleration in its driver's output.
     """
 
     patterns: Callable[[int, int, Path | None], PatternOfTurn]
@@ -58,14 +58,14 @@ def _bpearl(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
 
 
 def _airy(rate_hz: int, every_block: int, _: Path | None) -> PatternOfTurn:
-    """A RoboSense Airy: 96 channels, eight at a time, over a hemisphere."""
+    """A RoboSense Airy: 96 channels that fire eight at a time over a hemisphere."""
     elevation, still = np.radians(AIRY.elevations_deg), np.zeros(AIRY.channels)
     pattern = turning(elevation, still, AIRY.firing_offsets_ns, AIRY.block_ns, rate_hz, every_block, AIRY.rx, AIRY.rz)
     return lambda turn: pattern
 
 
 def _jt128(rate_hz: int, every_block: int, tables: Path | None) -> PatternOfTurn:
-    """A Hesai JT128: 128 channels, far apart in azimuth [HesaiLidar_SDK_2.0, angles and firing times]."""
+    """A Hesai JT128: 128 channels with large azimuth steps [HesaiLidar_SDK_2.0, angles and firing times]."""
     folder = _tables(tables, "jt128_angles.csv", "jt128_firetimes.csv")
     _, firing_us = _table(folder / "jt128_firetimes.csv", 128, 2).T
     firing_ns = np.rint(firing_us * 1000).astype(np.int64)
@@ -105,9 +105,9 @@ def _tables(folder: Path | None, *names: str) -> Path:
 
 
 def _table(path: Path, rows: int, columns: int) -> F64:
-    """The numbers in a file: (rows, columns) of a .csv below its heading, at least so many rows of an .npy.
+    """The numbers in a file: a .csv of this shape below its heading, or an .npy with at least this many rows.
 
-    Raises HemislamError: it holds no such table.
+    Raises HemislamError: the file holds no such table.
     """
     try:
         if path.suffix == ".csv":
@@ -152,5 +152,5 @@ SCANNERS: dict[str, Scanner] = {
         accel_unit=GRAVITY,
     ),
 }
-"""By name. `bpearl`: an RS-Bpearl on H2LID's IMU. The others bring their own IMU; an Airy and a JT128 are held as the
-RS-Bpearl is, a Mid-360 upright. Rated ranges and noise: the data sheets."""
+"""Scanners by name. `bpearl` is an RS-Bpearl on H2LID's IMU. The others have their own IMU; an Airy and a JT128 are
+held like the RS-Bpearl, a Mid-360 upright. Rated ranges and noise are from the data sheets."""

@@ -1,4 +1,4 @@
-"""One trajectory through one scene, measured and written to disk."""
+"""Simulates the measurements along one trajectory through one scene, and writes them to disk."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -34,24 +34,24 @@ from app.slam.trajectory import Trajectory, write_tum
 from app.slam.types import F64, I64
 
 START_NS = 1_700_000_000_000_000_000
-"""Every recording starts at this moment."""
+"""Start time of every recording."""
 
 TRANSPORT_NS = 4_000_000
-"""A cloud reaches the recorder this long after its last point."""
+"""Delay from the last point of a cloud to its arrival at the recorder."""
 
 _FIRST_TURN_S = 0.05
 _IMU_PERIOD_NS = 1_000_000_000 // IMU_RATE_HZ
 
 _TRAJECTORY, _IMU, _LIDAR, _UNIT, _PEOPLE, _GNSS = 1, 2, 3, 4, 5, 6
-"""Streams of random numbers that do not disturb one another (0 is the scene's)."""
+"""Independent streams of random numbers (stream 0 is the scene's)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationSummary:
-    """What was written.
+    """The recording that was written.
 
     Attributes:
-        recording: the file. bytes: its size. scans, points: how many it holds.
+        recording: the file. bytes: its size. scans, points: their numbers.
         duration_s, distance_m: of the trajectory.
     """
 
@@ -82,33 +82,33 @@ def simulate(
     gnss: Gnss | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulationSummary:
-    """Simulate a person who carries a LiDAR and an IMU, and write it as a ROS 2 recording.
+    """Simulate a person who carries a LiDAR and an IMU, and write a ROS 2 recording.
 
-    Beside `out` (`<stem>.mcap`, streamed scan by scan) it writes the truth `<stem>_truth.tum`
-    (T_world_imu at every scan's end, absolute seconds, exact; the world's z is up) and
-    `<stem>.params.yaml` (the sensor's mounting, loaded with the recording). The same
-    arguments give the same measurements. Existing files are replaced once all is written.
+    Besides `out` (`<stem>.mcap`, written scan by scan), this writes the exact truth `<stem>_truth.tum` (T_world_imu at
+    every scan's end, absolute seconds; the world's z is up) and `<stem>.params.yaml` (the sensor's mounting, loaded
+    with the recording). The same arguments give the same measurements. Existing files are replaced after everything
+    is written.
 
     Args:
         scene: a name in SCENES. out: ends in .mcap; its folder must exist.
-        duration_s: of the recording, the still start (walker.still) included.
-        seed: of everything random: the scene's details, the trajectory, noise and biases.
-        rate_hz: scans a second. every_block: fire every k-th block only, so that a scan of an
-            RS-Bpearl has 57,632 / k firings at 10 Hz and the file is small.
-        range_step: m, rounding of distances: 0.005, or 0.0025 for a newer unit; 0 = none.
+        duration_s: of the recording, including the still start (walker.still).
+        seed: for everything random: the scene's details, the trajectory, noise and biases.
+        rate_hz: scans per second. every_block: fire only every k-th block, so that a scan of an RS-Bpearl has
+            57,632 / k firings at 10 Hz and the file is small.
+        range_step: m, rounding of ranges: 0.005, or 0.0025 for a newer unit; 0 = none.
         coordinate_step: m, rounding of x, y, z; 0 = none. A power of two near the noise, such as
             0.00390625, makes the file a third smaller.
         walker: how the person walks; None = the defaults.
         imperfections: errors of a real scanner and hand, and people beside the operator.
-        unit_seed: of the errors that one scanner has all the time; None: `seed`.
-        scanner: a name in SCANNERS. tables: folder with its maker's tables, where it takes some.
-        upright: held with the LiDAR's z up rather than looking forward; None: as usual for it.
-        gnss: a satellite receiver beside; where the world truly lies is then in `<stem>_georeference.json`.
-        progress: called with (scans done, scans in all).
+        unit_seed: for the constant errors of one scanner; None: `seed`.
+        scanner: a name in SCANNERS. tables: folder with its maker's tables, if it needs any.
+        upright: held with the LiDAR's z up instead of forward; None: as usual for this scanner.
+        gnss: an additional satellite receiver; the true georeference is then in `<stem>_georeference.json`.
+        progress: called with (scans done, all scans).
 
     Raises:
-        HemislamError: unknown scene, an argument out of range, a file that cannot be written,
-            or open3d that cannot be loaded.
+        HemislamError: the scene is unknown, an argument is out of range, a file cannot be written, or open3d cannot be
+            loaded.
     """
     out = Path(out)
     device = _device(scanner, upright, rate_hz)
@@ -195,7 +195,7 @@ def simulate(
 
 
 def unit_of(imperfections: Imperfections, seed: int, channels: int = CHANNELS) -> Unit:
-    """The scanner with which `simulate` fires."""
+    """The scanner that `simulate` uses."""
     return Unit(imperfections, _random(seed, _UNIT), channels)
 
 
@@ -213,7 +213,7 @@ _SIDECAR = "# Mounting of the simulated scanner; read with the recording beside 
 
 
 def _settings(lidar: Lidar) -> dict[str, Any]:
-    """The parameters that a recording of it is read with."""
+    """The parameters with which its recordings are read."""
     sensor = {"translation": lidar.p_imu_lidar.tolist()}
     if not np.array_equal(lidar.R_imu_lidar, np.eye(3)):
         sensor["rotation"] = list(lie.rpy_degrees(lidar.R_imu_lidar))

@@ -1,8 +1,8 @@
-"""Suites of simulated walks: twins of the six sequences of the paper's Table 1, and six that revisit.
+"""Suites of simulated walks: twins of the six sequences of the paper's Table 1, and six walks with revisits.
 
-The twins have the same number of frames, duration and length; their places are `scenes.paper`. The others come back
-to where they were minutes before, in the same and in the opposite direction. The short form is the first minute of
-each, with fewer firings.
+The twins have the same numbers of frames, durations and lengths as the paper's sequences; their places are in
+`scenes.rooms` and `scenes.outdoors`. The other walks return to places visited minutes before, in the same and in the
+opposite direction. The short form is the first minute of each walk, with fewer firings.
 """
 
 import hashlib
@@ -24,12 +24,12 @@ from app.slam.errors import HemislamError
 RATE_HZ = 10
 SHORT_S = 60.0
 SHORT_EVERY_BLOCK = 3
-"""The short form fires every third azimuth, 19,000 a scan, so that it is simulated within minutes."""
+"""The short form fires at every third azimuth, 19,000 firings per scan, so that its simulation takes only minutes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Twin:
-    """One sequence: so many frames and metres through a scene; `back`: see `Walker`."""
+    """One sequence: a scene, and the numbers of frames and metres. `back`: see `Walker`."""
 
     scene: str
     frames: int
@@ -42,7 +42,7 @@ class Twin:
 
     @property
     def duration_s(self) -> float:
-        """Long enough for exactly these frames (the first begins after 0.05 s)."""
+        """Duration of exactly these frames (the first begins after 0.05 s)."""
         return self.frames / RATE_HZ + 0.05
 
 
@@ -86,12 +86,12 @@ def make_twin(
     imperfections: Imperfections = NONE,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Made:
-    """Simulate one sequence into `folder`, unless it is there already.
+    """Simulate one sequence into `folder`, unless it already exists.
 
-    The walker's speed is chosen so that the whole trajectory has the twin's length.
+    The walker's speed is chosen so that the trajectory has the length of the twin.
 
     Args:
-        every_block: fire every k-th azimuth only; None: all, or every SHORT_EVERY_BLOCK-th if short.
+        every_block: fire only at every k-th azimuth; None: at all, or at every SHORT_EVERY_BLOCK-th if short.
 
     Raises:
         HemislamError: as `simulate`.
@@ -123,12 +123,12 @@ def make_twin(
 
 
 def unit_seed(twin: Twin, seed: int) -> int:
-    """Each walk has a scanner of its own. With one scanner, the errors of a suite would be those of that scanner."""
+    """Each walk has a scanner of its own; otherwise the errors of a suite would be those of a single scanner."""
     return zlib.crc32(f"{twin.name} {seed}".encode())
 
 
 def fitting_speed(twin: Twin, seed: int) -> float:
-    """m/s, with which the whole trajectory has the twin's length, to a centimetre or so."""
+    """Speed, m/s, at which the trajectory has the length of the twin to about a centimetre."""
     place = build_scene(twin.scene, seed)
     times = np.arange(0.0, twin.duration_s, 1 / RATE_HZ)
     speed = twin.length_m / (twin.duration_s - 4.0)
@@ -140,14 +140,14 @@ def fitting_speed(twin: Twin, seed: int) -> float:
 
 
 def find_suite(name: str) -> tuple[Twin, ...]:
-    """Raises HemislamError if there is none of that name."""
+    """Find a suite by name. Raises HemislamError if there is none."""
     if name not in SUITES:
         raise HemislamError(f"There is no suite `{name}`; there is {', '.join(SUITES)}.")
     return SUITES[name]
 
 
 def _noted(path: Path) -> dict[str, Any]:
-    """What the note beside a recording says; {} if there is none."""
+    """The content of the note beside a recording; {} if there is none."""
     try:
         noted = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -156,7 +156,7 @@ def _noted(path: Path) -> dict[str, Any]:
 
 
 def _digest() -> str:
-    """Hash of the simulator's code, since changed code makes other recordings."""
+    """Hash of the simulator's code, since changed code produces different recordings."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())

@@ -1,10 +1,10 @@
-"""The trajectory of a handheld scanner as one smooth curve, and what an IMU on it measures.
+"""The trajectory of a handheld scanner as one smooth curve, and the measurements of an IMU along it.
 
-The curve is a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that every derivative is exact: poses,
-angular rates and specific forces belong to the same curve.
+The curve is a quintic spline through samples of (x, y, z, yaw, pitch, roll), so that derivatives are exact: poses,
+angular rates and specific forces are consistent.
 
-Frames: `world` has z up; `body` has x forward, y left, z up. By default the IMU is mounted as on H2LID:
-z forward, x down, y left, so that at rest it reads -9.81 m/s^2 on x.
+Frames: `world` has z up; `body` has x forward, y left, z up. By default, the IMU is mounted as on H2LID: z forward,
+x down, y left, so that it reads -9.81 m/s^2 on x at rest.
 """
 
 from collections.abc import Callable
@@ -27,12 +27,12 @@ _STEP_HZ = 1.8
 
 
 def seconds(ns: I64) -> F64:
-    """Differences of integer nanoseconds as seconds, the unit of a trajectory's time."""
+    """Convert differences of integer nanoseconds to seconds, the unit of a trajectory's time."""
     return ns.astype(np.float64) * 1e-9
 
 
 class SmoothTrajectory:
-    """Where the IMU is, at any time. Times are seconds from the recording's start, (n,) arrays."""
+    """Poses of the IMU at any time. Times are seconds from the recording's start, (n,) arrays."""
 
     def __init__(self, times: F64, samples: F64, R_body_imu: F64 = R_BODY_IMU) -> None:
         """Args: times (n,) increasing; samples (n, 6) of x, y, z (m), yaw, pitch, roll (rad) of the body."""
@@ -42,12 +42,12 @@ class SmoothTrajectory:
         self._acceleration = self._spline.derivative(2)
 
     def poses(self, t: F64) -> tuple[F64, F64]:
-        """Positions (n, 3) and rotations (n, 3, 3): R_world_imu, p_world_imu in reverse order."""
+        """Positions p_world_imu (n, 3) and rotations R_world_imu (n, 3, 3)."""
         values = self._spline(t)
         return values[:, :3], Rotation.from_euler("ZYX", values[:, 3:]).as_matrix() @ self.R_body_imu
 
     def motion(self, t: F64) -> tuple[F64, F64]:
-        """What a perfect IMU reads: angular rate (n, 3) rad/s and specific force (n, 3) m/s^2, IMU frame."""
+        """Measurements of a perfect IMU: angular rate (n, 3) rad/s and specific force (n, 3) m/s^2, IMU frame."""
         _, pitch, roll = self._spline(t)[:, 3:].T
         yaw_rate, pitch_rate, roll_rate = self._rate(t)[:, 3:].T
         body_rate = np.column_stack(
@@ -67,8 +67,8 @@ class ImuNoise:
     """The errors of the paper's Owllmo IMU3910; gyroscope in rad/s, accelerometer in m/s^2.
 
     Attributes:
-        gyro, accel: spread of a sample's white noise (paper 2.1, in the units it prints).
-        gyro_bias, accel_bias: spread of the constant bias each axis starts with.
+        gyro, accel: standard deviation of a sample's white noise (paper 2.1, in the units printed there).
+        gyro_bias, accel_bias: standard deviation of each axis's initial bias.
         gyro_walk, accel_walk: growth of the bias's random walk, per sqrt(s) (paper 2.1).
     """
 
@@ -83,7 +83,7 @@ class ImuNoise:
 def measured(
     trajectory: SmoothTrajectory, stamps_ns: I64, start_ns: int, noise: ImuNoise, rng: np.random.Generator
 ) -> ImuSamples:
-    """What the IMU reads at `stamps_ns`; the trajectory's time 0 is `start_ns`."""
+    """Measurements of the IMU at `stamps_ns`; the trajectory's time 0 is `start_ns`."""
     t = seconds(stamps_ns - start_ns)
     rate, force = trajectory.motion(t)
     gyro = rate + _errors(len(t), noise.gyro, noise.gyro_bias, noise.gyro_walk, rng)
@@ -96,11 +96,11 @@ class Walker:
     """How the person who carries the sensor walks.
 
     Attributes:
-        speed: m/s. height: m of the IMU above the ground. still: s of standing at the start.
-        bob, sway: m, half the swing up-down (each step) and left-right (each other step).
-        pitch, roll, yaw: rad, spread of the hand's slow wandering about each axis.
-        wander: m, spread of the slow sideways deviation from the path.
-        back: at the end of the path, turn round and walk it the other way.
+        speed: m/s. height: m, of the IMU above the ground. still: s, standing still at the start.
+        bob, sway: m, amplitudes of the motion up and down (every step) and sideways (every other step).
+        pitch, roll, yaw: rad, standard deviations of the hand's slow rotation about each axis.
+        wander: m, standard deviation of the slow sideways deviation from the path.
+        back: turn round at the end of the path and walk back.
     """
 
     speed: float = 1.2
@@ -125,16 +125,16 @@ def walk(
     height: Callable[[F64], F64] | None = None,
     R_body_imu: F64 = R_BODY_IMU,
 ) -> SmoothTrajectory:
-    """A person walks along waypoints, round a closed path for all of the time, or to the end of an open one.
+    """A person walks along waypoints: round a closed path for the whole time, or to the end of an open path.
 
     Args:
-        path: (n, 2) waypoints in plan, m, or (n, 3) with the floor's z there. height: the ground's z at (n, 2) points;
-            None is z = 0, or the path's.
+        path: (n, 2) waypoints in plan view, m, or (n, 3) with the floor's z at each. height: z of the ground at (n, 2)
+            points; None: 0, or the path's z.
         R_body_imu: how the IMU is mounted.
     """
     t = np.arange(-1.0, duration_s + 1.0, 1.0 / _SAMPLE_HZ)
     awake = _smoothstep((t - walker.still) / 1.5)
-    # Smoothing reaches back before the first step, hence the delay of one second.
+    # Smoothing also affects the time before the first step, hence the delay of one second.
     walking = _smoothstep((t - walker.still - 1.0) / 1.5)
     speed = walker.speed * walking * (1.0 + 0.1 * _wander(t, rng, (0.05, 0.15)))
     travelled = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2) / _SAMPLE_HZ])
@@ -147,7 +147,7 @@ def walk(
     places = places_at(travelled, arc, line)
     xy = np.column_stack([gaussian_filter1d(places[:, k], 0.4 * _SAMPLE_HZ, mode="nearest") for k in (0, 1)])
 
-    # The walker looks half a metre ahead, and turns over about as much.
+    # The walker looks half a metre ahead, and spreads a turn over about the same distance.
     step = 0.05
     s = np.arange(0.0, arc[-1], step)
     directions = np.unwrap(np.arctan2(*np.gradient(places_at(s, arc, line)[:, :2], axis=0).T[::-1]))
@@ -182,14 +182,14 @@ def _smoothstep(x: F64) -> F64:
 
 
 def _wander(t: F64, rng: np.random.Generator, band_hz: tuple[float, float]) -> F64:
-    """A smooth random function of unit spread: a few sines with frequencies in the band."""
+    """A smooth random function with unit standard deviation: a few sines with frequencies in the band."""
     frequencies = rng.uniform(*band_hz, 5)
     phases = rng.uniform(0, 2 * np.pi, 5)
     return np.asarray(np.sin(2 * np.pi * np.outer(t, frequencies) + phases).sum(axis=1) * np.sqrt(2 / 5))
 
 
 def _unrolled(path: F64, closed: bool, length: float) -> tuple[F64, F64]:
-    """The path as one polyline of at least `length` if closed, and the arc length at each vertex."""
+    """The path as one polyline, of at least `length` if closed, and the arc length at each vertex."""
     line = np.asarray(path, np.float64)
     if closed:
         lap = np.vstack([line, line[:1]])
@@ -199,12 +199,12 @@ def _unrolled(path: F64, closed: bool, length: float) -> tuple[F64, F64]:
 
 
 def places_at(lengths: F64, arc: F64, line: F64) -> F64:
-    """(k, 2 or 3) places on a polyline of such points at these arc lengths; `arc` is `walked_m(line)`."""
+    """(k, 2 or 3) points on a polyline at these arc lengths; `arc` is `walked_m(line)`."""
     return np.column_stack([np.interp(lengths, arc, along) for along in line.T])
 
 
 def _brake(travelled: F64, end: float) -> F64:
-    """Stop gently two metres before the end of an open path."""
+    """From two metres before the end of an open path, slow down gently; stop one metre before the end."""
     limit = end - 1.0
     over = np.maximum(travelled - (limit - 1.0), 0.0)
     return np.where(travelled > limit - 1.0, limit - 1.0 + np.tanh(over), travelled)

@@ -1,4 +1,4 @@
-"""Procedural scenes: a mesh, what moves in it, and the path of the person with the sensor. One function each."""
+"""Procedural scenes: a mesh, moving bodies, and the path of the person with the sensor. One function per scene."""
 
 import difflib
 from collections.abc import Callable
@@ -26,7 +26,7 @@ SCENES: dict[str, str] = {name: (builder.__doc__ or "").splitlines()[0] for name
 
 
 def build_scene(name: str, seed: int) -> SimulatedScene:
-    """The scene; the same seed gives the same scene. Raises HemislamError, which names the scenes."""
+    """Build a scene; the same seed gives the same scene. Raises HemislamError, which names the scenes."""
     if name not in _BUILDERS:
         near = difflib.get_close_matches(name, _BUILDERS, n=1)
         hint = f"did you mean `{near[0]}`?" if near else f"there are {', '.join(_BUILDERS)}."

@@ -1,4 +1,4 @@
-"""A cloister on a slope: a garden in a court of columns, a hall up some steps, a black passage, a park below."""
+"""A cloister on a slope: a court with columns and a garden, a raised hall, a black passage, and a park below."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from app.sensors.simulator.scenes.props import grid, level, on_ground, tiled
 from app.slam.types import F64
 
 GARTH, COURT = 6.0, 9.0
-"""m from the court's middle to its columns, and to its walls."""
+"""m, from the court's middle to its columns, and to its walls."""
 HALL = (9.0, 17.6)
-"""y of the hall's near and far wall; it is as wide as the court."""
+"""y of the hall's near and far walls; the hall is as wide as the court."""
 FLOOR, HEIGHT = 0.64, 5.6
-"""m, of the hall's floor above the court, and of its ceiling above its floor."""
+"""m, height of the hall's floor above the court, and of its ceiling above its floor."""
 DOORS = (-5.4, 5.4)
 """x of the hall's doors, each at the top of four steps."""
 _STEPS, _TREAD = 4, 0.3
@@ -25,17 +25,17 @@ _FIRST_LAP = [
     *((-0.6, -5.0), (1.5, -2.6), (2.9, -0.6), (5.0, 0.0), (8.4, 0.0), (10.2, -0.2)),
     *((10.2, -10.4), (8.4, -11.0), (3.6, -12.6), (0.6, -11.8), (0.0, -9.6), (0.0, -7.0)),
 ]
-"""Round the fountain, through the passage and the park, back by the gate."""
+"""Path round the fountain, through the passage and the park, and back through the gate."""
 _SECOND_LAP = [
     *((-0.6, -5.0), (-1.6, -2.6), (-2.9, -0.4), (-5.0, 0.0), (-7.0, 0.2), (-7.5, 6.6), (-5.4, 7.7), (-5.4, 11.0)),
     *((-3.8, 13.6), (3.8, 13.6), (5.4, 11.0), (5.4, 7.7), (7.5, 6.6), (7.4, 0.8), (5.0, 0.0), (2.6, -1.4)),
     *((1.0, -3.4), (-0.3, -5.0), (0.0, -8.0)),
 ]
-"""Up one flight of steps, through the hall, down the other."""
+"""Path up one flight of steps, through the hall, and down the other."""
 
 
 def cloister(rng: np.random.Generator) -> SimulatedScene:
-    """A figure of eight through a cloister: a black passage and a sloping park, then a pillared hall up some steps."""
+    """A figure of eight through a cloister: a black passage and a sloping park, then a raised hall with pillars."""
     mesh = MeshBuilder()
     _court(mesh, rng)
     _passage(mesh)
@@ -52,7 +52,7 @@ def cloister(rng: np.random.Generator) -> SimulatedScene:
 
 
 def _terrain(xy: F64) -> F64:
-    """Level at the court's wall, then down, with a knoll in the west."""
+    """Height of the terrain: level at the court's wall, then falling, with a knoll in the west."""
     x, y = xy.T
     down = np.maximum(-COURT - y, 0.0)
     knoll = 1.3 * np.exp(-(((x + 9.0) / 3.5) ** 2) - ((y + 15.0) / 3.0) ** 2)
@@ -60,13 +60,13 @@ def _terrain(xy: F64) -> F64:
 
 
 def _ramp(xy: F64) -> F64:
-    """The passage's floor, from the court down to the park."""
+    """Height of the passage's floor, which falls from the court to the park."""
     low = float(_terrain(np.array([[PASSAGE[0], PASSAGE[2]]]))[0])
     return np.asarray(low * np.clip((-1.0 - xy[:, 1]) / (-1.0 - PASSAGE[2]), 0.0, 1.0))
 
 
 def _floor(xy: F64) -> F64:
-    """Where people walk: the treads of the steps, too."""
+    """Height of the floor on which people walk, including the treads of the steps."""
     x, y = xy.T
     step = np.clip(np.ceil((y - HALL[0]) / _TREAD + _STEPS), 0, _STEPS) * FLOOR / _STEPS
     below = np.where(x > PASSAGE[0], _ramp(xy), _terrain(xy))
@@ -95,7 +95,7 @@ def _court(mesh: MeshBuilder, rng: np.random.Generator) -> None:
             mesh.cylinder((x, y, 0.0), 0.19, 3.0, _STONE, sides=16)
             mesh.box((x, y, 0.14), (0.6, 0.6, 0.28), _STONE)
             mesh.box((x, y, 2.92), (0.56, 0.56, 0.2), _STONE)
-    for side in (-1, 1):  # what the columns carry: beams of stone, and of wood to the walls
+    for side in (-1, 1):  # beams on the columns: of stone, and of wood to the walls
         mesh.box((0.0, side * GARTH, 3.2), (2 * GARTH + 0.6, 0.5, 0.4), _STONE)
         mesh.box((side * GARTH, 0.0, 3.2), (0.5, 2 * GARTH + 0.6, 0.4), _STONE)
         for s in np.linspace(-GARTH - 2.0, GARTH + 2.0, 9):
@@ -116,7 +116,7 @@ def _court(mesh: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _passage(mesh: MeshBuilder) -> None:
-    """Walls, floor and ceiling of black felt: little returns, and nothing tells how far one has gone."""
+    """Walls, floor and ceiling of black felt: few returns, and nothing that shows the distance travelled."""
     x0, x1, y0, y1 = PASSAGE
     middle, length = (y0 + y1) / 2, y1 - y0
     mesh.surface(np.array([COURT, x1]), np.linspace(y0, y1, 30), _ramp, lambda xy: np.full(len(xy), _FELT))

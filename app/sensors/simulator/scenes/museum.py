@@ -1,4 +1,4 @@
-"""A museum's court and its glass-roofed hall: out of doors, in by one door, out by the other."""
+"""A museum's court and its glass-roofed hall: a path outdoors, in through one door and out through the other."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ EAVES = 5.2
 
 
 def museum(rng: np.random.Generator) -> SimulatedScene:
-    """Indoors and out: round a sloping court with trees, cars and a fountain, through a museum's pillared hall."""
+    """Outdoors and indoors: round a sloping court with trees, cars and a fountain, and through a hall with pillars."""
     mesh = MeshBuilder()
     _court(mesh, rng)
     _hall(mesh, rng)
@@ -32,7 +32,7 @@ def museum(rng: np.random.Generator) -> SimulatedScene:
 
 
 def _terrain(xy: F64) -> F64:
-    """Level at the hall, then down towards the street, with a knoll in the east."""
+    """Height of the terrain: level at the hall, then falling towards the street, with a knoll in the east."""
     x, y = xy.T
     down = np.maximum(2.0 - y, 0.0)
     slope = 0.075 * down**2 / (down + 4.0)

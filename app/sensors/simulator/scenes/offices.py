@@ -12,11 +12,11 @@ from app.slam.types import F64
 
 HEIGHT = 2.7
 WIDTH = 2.4
-"""m, of the corridors."""
+"""m, width and height of the corridors."""
 LENGTH, DEPTH, LOBBY = 42.0, 15.0, 6.0
 """m, of `building`."""
 STOREY, STEPS, RUN = 3.3, 10, 0.32
-"""m from floor to floor of `storeys`; steps of each of the two flights between them, and m from step to step."""
+"""m, from floor to floor of `storeys`; number of steps in each of the two flights, and m from step to step."""
 
 
 def corridor(rng: np.random.Generator) -> SimulatedScene:
@@ -47,7 +47,7 @@ def corridor(rng: np.random.Generator) -> SimulatedScene:
 
 
 def building(rng: np.random.Generator) -> SimulatedScene:
-    """Two wings of office corridors that share one, 138 m a lap: one lap, a turn in the lobby, and all of it back."""
+    """Two wings of office corridors that share one, 138 m a lap: a lap, a turn in the lobby, and the lap reversed."""
     mesh = MeshBuilder()
     reach = 4.2  # rooms behind the outer walls
     storey(mesh, rectangle(-reach, -LOBBY - 0.3, LENGTH + reach, DEPTH + reach), HEIGHT, 0.6, tiled(0.38), 0.7)
@@ -74,12 +74,12 @@ def building(rng: np.random.Generator) -> SimulatedScene:
     ]
     turn = [(middle - 0.3, -1.6), (middle - 1.2, -2.9), (middle, -4.2), (middle + 1.2, -2.9), (middle + 0.3, -1.6)]
     someone = props.pedestrian(rectangle(1.85, 1.85, middle - 1.85, DEPTH - 1.85)[::-1], 1.1)
-    # down the shared corridor twice, once from either wing; then the same lap the other way
+    # along the shared corridor twice, once from each wing; then the same lap in reverse
     return SimulatedScene(mesh.build(), (someone,), np.array([*lap, *turn, *lap[::-1][:-1]]))
 
 
 def storeys(rng: np.random.Generator) -> SimulatedScene:
-    """Two storeys alike, 46 m a lap, joined by a staircase: a lap below, one above, and another below."""
+    """Two identical storeys, 46 m a lap, joined by a staircase: a lap below, one above, and another below."""
     east, north, half = 18.0, 10.0, WIDTH / 2
     well = rectangle(east, 3.6, east + 5.8, 6.4)
     one = MeshBuilder()
@@ -87,7 +87,7 @@ def storeys(rng: np.random.Generator) -> SimulatedScene:
     south_wall, east_wall, *other_walls = sides(rectangle(0, 0, east, north))
     for wall in (south_wall, *other_walls):
         _outer_wall(one, *wall, rng)
-    one.wall(*east_wall, HEIGHT, 0.65, [(4.4, 5.6, 0.0, 2.1)])  # the way to the stairs
+    one.wall(*east_wall, HEIGHT, 0.65, [(4.4, 5.6, 0.0, 2.1)])  # the door to the stairs
     for wall in sides(rectangle(WIDTH, WIDTH, east - WIDTH, north - WIDTH)):
         _inner_wall(one, *wall, rng)
     one.boxes(grid(np.arange(2.5, east, 4.5), (half, north - half), HEIGHT - 0.03), (1.2, 0.3, 0.06), 0.9)
@@ -105,7 +105,7 @@ def storeys(rng: np.random.Generator) -> SimulatedScene:
 
 
 def _staircase(mesh: MeshBuilder, well: list[Point], top: float) -> None:
-    """Two flights with a landing between them, in a well whose first wall is that of the storeys."""
+    """Two flights with a landing between them, in a stairwell that shares its first wall with the storeys."""
     (x, y), (far, _), (_, back), _ = well
     middle = (y + back) / 2
     for wall in sides(well)[:3]:
@@ -123,7 +123,7 @@ def _staircase(mesh: MeshBuilder, well: list[Point], top: float) -> None:
 
 
 def _slab(mesh: MeshBuilder, top: Triple, size: Triple) -> None:
-    """A box whose top, with its middle at `top`, is floor."""
+    """A box whose top, centred at `top`, is a floor."""
     (x, y, z), (length, width, thickness) = top, size
     mesh.box((x, y, z - thickness / 2 - 0.001), size, 0.5)
     corners = rectangle(x - length / 2, y - width / 2, x + length / 2, y + width / 2)
@@ -131,7 +131,7 @@ def _slab(mesh: MeshBuilder, top: Triple, size: Triple) -> None:
 
 
 def _outer_wall(mesh: MeshBuilder, start: Point, end: Point, rng: np.random.Generator) -> None:
-    """Doors every few metres, some open to a furnished room; pillars and odds and ends between them."""
+    """Doors every few metres, some open to a furnished room; pillars and other objects between them."""
     a, along, length, yaw = line_through(start, end)
     outward = np.array([along[1], -along[0]])
     openings = []
@@ -162,7 +162,7 @@ def _outer_wall(mesh: MeshBuilder, start: Point, end: Point, rng: np.random.Gene
 
 
 def _inner_wall(mesh: MeshBuilder, start: Point, end: Point, rng: np.random.Generator) -> None:
-    """Shallow niches with closed doors or panes, radiators under them."""
+    """Shallow niches with closed doors, or with windows above radiators."""
     a, along, length, yaw = line_through(start, end)
     inward = np.array([-along[1], along[0]])
     openings = []
@@ -181,7 +181,7 @@ def _inner_wall(mesh: MeshBuilder, start: Point, end: Point, rng: np.random.Gene
 
 
 def _office(mesh: MeshBuilder, door: F64, along: F64, outward: F64, rng: np.random.Generator) -> None:
-    """A small room behind a door, closed all round."""
+    """A small closed room behind a door."""
     half, depth = 1.65, rng.uniform(3.0, 3.8)
     yaw = float(np.arctan2(outward[1], outward[0]))
     left, right = door - along * half, door + along * half

@@ -1,7 +1,7 @@
-"""Places under the open sky: a campus, and twins of the four paths outdoors of the paper (Table 1).
+"""Outdoor scenes: a campus, and twins of the paper's four outdoor paths (Table 1).
 
-Each of the paper's paths begins with a small lap, so that the first minute already returns to its start; outdoor_4
-never returns, as in the paper.
+The twins begin with a small lap, so that the first minute already returns to its start; outdoor_4 never returns, as in
+the paper.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from app.slam.types import F64
 
 _ASPHALT, _GRASS = 0.18, 0.42
 _EDGE = 45.0
-"""m of ground around the path; beyond it a laser sees the sky."""
+"""m, width of the ground around the path; beyond it, beams hit nothing."""
 
 _CAMPUS = [
     *((-14.0, -13.0), (0.0, -15.0), (14.0, -12.0), (22.0, -3.0), (19.0, 8.0)),
@@ -42,7 +42,7 @@ _THREE_ROUNDS = [
 
 
 def outdoor(rng: np.random.Generator) -> SimulatedScene:
-    """A campus with slopes, buildings, trees, hedges, parked cars and people who walk about."""
+    """A campus with slopes, buildings, trees, hedges, parked cars and pedestrians."""
     mesh = MeshBuilder()
     path = np.array(_CAMPUS)
     phase = rng.uniform(0, 2 * np.pi, 4)
@@ -116,14 +116,14 @@ def outdoor_3(rng: np.random.Generator) -> SimulatedScene:
 
 
 def outdoor_4(rng: np.random.Generator) -> SimulatedScene:
-    """One long winding road, 640 m, that never comes back."""
+    """One long winding road, 640 m, that never returns."""
     x = np.arange(0.0, 520.0, 10.0)
     path = np.column_stack([x, 38.0 * np.sin(x / 34.0) + 12.0 * np.sin(x / 71.0)])
     return _streets(rng, path, closed=False, built=0.5)
 
 
 def _streets(rng: np.random.Generator, way: Corners, *, closed: bool = True, built: float = 0.7) -> SimulatedScene:
-    """Rolling ground with buildings (where `built`, 0-1, has them), trees, cars and people along a path."""
+    """Rolling ground with buildings (density `built`, 0-1), trees, cars and people along a path."""
     mesh, path = MeshBuilder(), np.array(way)
     phase = rng.uniform(0, 2 * np.pi, 4)
 
@@ -135,7 +135,7 @@ def _streets(rng: np.random.Generator, way: Corners, *, closed: bool = True, bui
     way_points: Any = KDTree(_along(path, closed, 0.2)[0])  # type: ignore[no-untyped-call]  # scipy ships no types
 
     def off(*places: tuple[float, float]) -> float:
-        """m from the nearest of these to the path, good to 0.1 m."""
+        """Least distance (m) of these points from the path, accurate to 0.1 m."""
         return float(way_points.query(places)[0].min())
 
     def shade(xy: F64) -> F64:
@@ -184,7 +184,7 @@ def _streets(rng: np.random.Generator, way: Corners, *, closed: bool = True, bui
 
 
 def _people(rng: np.random.Generator, places: F64, headings: F64, height: Callable[[F64], F64]) -> tuple[Mover, ...]:
-    """Some who walk up and down beside the path."""
+    """People who walk up and down beside the path."""
     people = []
     for k in rng.choice(len(places) - 20, size=max(2, len(places) // 80), replace=False):
         there = [_beside(places[k + 5 * step], headings[k + 5 * step], 1.6) for step in range(4)]
@@ -194,7 +194,7 @@ def _people(rng: np.random.Generator, places: F64, headings: F64, height: Callab
 
 
 def _along(path: F64, closed: bool, step: float) -> tuple[F64, F64]:
-    """Places every `step` m of the path and the heading there."""
+    """Places every `step` m along the path, and the headings there."""
     line = np.vstack([path, path[:1]]) if closed else path
     arc = walked_m(line)
     s = np.arange(0.0, arc[-1], step)
@@ -208,14 +208,14 @@ def _beside(place: F64, heading: float, left: float) -> tuple[float, float]:
 
 
 def _footprint(x: float, y: float, heading: float, size: tuple[float, float, float]) -> list[Point]:
-    """Points of a building's outline: its corners, and some of its edges."""
+    """Points on a building's outline: its corners, and some points on its edges."""
     c, s = float(np.cos(heading)), float(np.sin(heading))
     outline = [(u * size[0] / 2, v * size[1] / 2) for u in (-1.0, -0.5, 0.0, 0.5, 1.0) for v in (-1.0, 0.0, 1.0)]
     return [(x + c * u - s * v, y + s * u + c * v) for u, v in outline]
 
 
 def _distance_to_path(xy: F64, path: F64) -> F64:
-    """(n,) m from (n, 2) points to a closed polyline of (m, 2) waypoints."""
+    """(n,) distances (m) of (n, 2) points from a closed polyline of (m, 2) waypoints."""
     nearest = np.full(len(xy), np.inf)
     for a, b in zip(path, np.roll(path, -1, axis=0), strict=True):
         share = np.clip((xy - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)

@@ -1,6 +1,6 @@
-"""What scenes are built of: floors and walls, furniture, plants, vehicles and people.
+"""Parts of scenes: floors and walls, furniture, plants, vehicles and people.
 
-Sizes in metres, `at` is (x, y, floor z), yaw in radians.
+Sizes are in metres, `at` is (x, y, floor z), yaw is in radians.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -16,7 +16,7 @@ from app.slam.types import F64
 
 Point = tuple[float, float]
 Corners = Sequence[Point] | F64
-"""A polygon or polyline in plan, m."""
+"""A polygon or polyline in plan view, m."""
 
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[Point]:
@@ -35,7 +35,7 @@ def grid(xs: Iterable[float], ys: Iterable[float], z: float) -> list[tuple[float
 
 
 def on_ground(height: Callable[[F64], F64]) -> Callable[[float, float], tuple[float, float, float]]:
-    """From a place in plan to the point of the terrain there."""
+    """A function from (x, y) to the point of the terrain there."""
     return lambda x, y: (x, y, float(height(np.array([[x, y]]))[0]))
 
 
@@ -45,7 +45,7 @@ def level(xy: F64) -> F64:
 
 
 def tiled(reflectivity: float, size: float = 0.6) -> Callable[[F64], F64]:
-    """The reflectivity of floor tiles, each other one a little brighter."""
+    """The reflectivity of floor tiles; every other tile is slightly brighter."""
 
     def shade(xy: F64) -> F64:
         odd = np.floor(xy / size).sum(axis=1) % 2
@@ -64,7 +64,7 @@ def storey(
 
 
 def _place(at: Triple, yaw: float) -> Callable[[float, float, float], tuple[float, float, float]]:
-    """From a prop's own coordinates to the world's."""
+    """Convert a prop's own coordinates to world coordinates."""
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
     return lambda x, y, z: (at[0] + c * x - s * y, at[1] + s * x + c * y, at[2] + z)
 
@@ -78,7 +78,7 @@ def table(mesh: MeshBuilder, at: Triple, yaw: float = 0.0, size: tuple[float, fl
 
 
 def chair(mesh: MeshBuilder, at: Triple, yaw: float = 0.0) -> None:
-    """Its back is at -x."""
+    """A chair with its back at -x."""
     p = _place(at, yaw)
     mesh.box(p(0, 0, 0.45), (0.45, 0.45, 0.05), 0.4, yaw)
     mesh.box(p(-0.21, 0, 0.72), (0.04, 0.45, 0.5), 0.4, yaw)
@@ -88,7 +88,7 @@ def chair(mesh: MeshBuilder, at: Triple, yaw: float = 0.0) -> None:
 def shelf(
     mesh: MeshBuilder, at: Triple, yaw: float, rng: np.random.Generator, size: tuple[float, float] = (1.2, 2.0)
 ) -> None:
-    """Open to +x, with books."""
+    """A shelf with books, open towards +x."""
     p = _place(at, yaw)
     width, height = size
     mesh.box(p(-0.16, 0, height / 2), (0.02, width, height), 0.5, yaw)
@@ -103,7 +103,7 @@ def shelf(
 
 
 def sofa(mesh: MeshBuilder, at: Triple, yaw: float = 0.0) -> None:
-    """Its back is at -x."""
+    """A sofa with its back at -x."""
     p, width = _place(at, yaw), 1.9
     mesh.box(p(0, 0, 0.22), (0.85, width, 0.44), 0.3, yaw)
     mesh.box(p(-0.36, 0, 0.55), (0.2, width, 0.5), 0.3, yaw)
@@ -121,7 +121,7 @@ def extinguisher(mesh: MeshBuilder, at: Triple) -> None:
 
 
 def sculpture(mesh: MeshBuilder, at: Triple, rng: np.random.Generator) -> None:
-    """Three ellipsoids on a plinth."""
+    """A sculpture: three ellipsoids on a plinth."""
     x, y, floor = at
     mesh.box((x, y, floor + 0.45), (0.7, 0.7, 0.9), 0.7, rng.uniform(0, 0.6))
     for z in (1.15, 1.55, 1.85):
@@ -131,7 +131,7 @@ def sculpture(mesh: MeshBuilder, at: Triple, rng: np.random.Generator) -> None:
 
 
 def door_leaf(mesh: MeshBuilder, hinge: Triple, yaw: float, width: float = 0.9, height: float = 2.1) -> None:
-    """A leaf that reaches from its hinge along +x of `yaw`, with a handle on either side."""
+    """A door leaf that extends from its hinge along +x of `yaw`, with a handle on either side."""
     p = _place(hinge, yaw)
     mesh.box(p(width / 2, 0, height / 2), (width, 0.04, height), 0.5, yaw)
     mesh.box(p(width - 0.1, 0, 1.05), (0.12, 0.14, 0.03), 0.25, yaw)
@@ -185,7 +185,7 @@ def lamp_post(mesh: MeshBuilder, at: Triple, height: float = 4.5) -> None:
 
 
 def person_mesh(height: float = 1.75) -> Mesh:
-    """Mid-stride, facing +x."""
+    """A person in mid-stride, facing +x."""
     mesh = MeshBuilder()
     scale = height / 1.75
     mesh.ellipsoid((0, 0, 1.63 * scale), (0.1, 0.08, 0.12), 0.4)
@@ -201,7 +201,7 @@ def person_mesh(height: float = 1.75) -> Mesh:
 def pedestrian(
     corners: Corners, speed: float, start: float = 0.0, height: Callable[[F64], F64] | None = None, size: float = 1.75
 ) -> Mover:
-    """A person who walks round a closed polygon without end, `start` metres along it at time 0."""
+    """A person who endlessly walks round a closed polygon, `start` metres along it at time 0."""
     path = _rounded(np.array(corners, np.float64))
     loop = np.vstack([path, path[:1]])
     arc = walked_m(loop)
@@ -219,7 +219,7 @@ def pedestrian(
 
 
 def _rounded(outline: F64) -> F64:
-    """(n, 2) waypoints a metre apart round a closed polygon, its corners cut."""
+    """(n, 2) waypoints a metre apart round a closed polygon with cut corners."""
     points: list[F64] = []
     for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         length = float(np.linalg.norm(b - a))
@@ -228,7 +228,7 @@ def _rounded(outline: F64) -> F64:
 
 
 def building(mesh: MeshBuilder, at: Triple, size: Triple, yaw: float = 0.0) -> None:
-    """Rows of windows on all sides, a plinth, a gabled roof; walls reach 2 m below `at`, for slopes."""
+    """A building with rows of windows, a plinth and a gabled roof; its walls reach 2 m below `at`, for slopes."""
     p = _place(at, yaw)
     length, depth, height = size
     mesh.box(p(0, 0, height / 2 - 1.0), (length, depth, height + 2.0), 0.4, yaw)

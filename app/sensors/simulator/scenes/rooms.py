@@ -1,4 +1,4 @@
-"""Rooms: one furnished, a garage and an office as in the paper, and two traps: equal corridors and equal flats."""
+"""Indoor scenes: a furnished room, a garage and an office as in the paper, and two sets of identical places."""
 
 import numpy as np
 
@@ -8,17 +8,17 @@ from app.sensors.simulator.scenes import props
 from app.sensors.simulator.scenes.props import grid, rectangle, sides, storey, tiled
 
 HEIGHT, WIDTH = 2.6, 2.0
-"""m, of the corridors of `identical`."""
+"""m, width and height of the corridors of `identical`."""
 PITCH, CORRIDORS = 6.0, 5
-"""Distance between the middles of neighbouring corridors, m, and how many there are."""
+"""Distance between the middles of neighbouring corridors, m, and number of corridors."""
 BAY, BAYS = 4.0, 4
-"""Distance from door to door along a corridor, m, and how many there are on either side."""
+"""Distance from door to door along a corridor, m, and number of doors on either side."""
 FLAT, FLATS, FLAT_DEPTH = 7.0, 3, 9.0
-"""Width of each of the `flats`, how many there are, and their depth, m."""
+"""Width of each of the `flats` (m), their number, and their depth (m)."""
 
 
 def room(rng: np.random.Generator) -> SimulatedScene:
-    """A furnished room of 12 x 9 m: tables, chairs, shelves, sofas, windows, someone pacing at the far end."""
+    """A furnished room of 12 x 9 m: tables, chairs, shelves, sofas, windows, and a person pacing at the far end."""
     length, depth, height = 12.0, 9.0, 2.8
     mesh = MeshBuilder()
     corners = rectangle(0, 0, length, depth)
@@ -145,12 +145,12 @@ def identical(rng: np.random.Generator) -> SimulatedScene:
     for c in range(CORRIDORS):
         x, ends = c * PITCH, (0.0, far)
         path += [(x, y) for y in (ends if c % 2 == 0 else ends[::-1])]
-    # the last corridor ends in the north: back along the north aisle and down the first corridor
+    # the last corridor ends in the north: return along the north aisle and the first corridor
     return SimulatedScene(mesh.build(), (), np.array([*path, (0.0, far)]))
 
 
 def flats(rng: np.random.Generator) -> SimulatedScene:
-    """Three equal flats in a row, furnished alike, each toured twice, then the first again; a gallery joins them."""
+    """Three identical flats in a row, joined by a gallery: each is toured twice, then the first again."""
     one, width = MeshBuilder(), FLATS * FLAT
     for wall, openings in (
         (((0.0, 0.0), (FLAT, 0.0)), [(0.8, 2.4, 0.0, 2.1), (3.6, 5.4, 0.9, 2.2)]),
