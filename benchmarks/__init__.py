@@ -1,1 +1,1 @@
-"""How long things take on this machine. `make bench` runs all; nothing here passes or fails."""
+"""Measurements of times on this machine. `make bench` runs all of them; nothing here passes or fails."""

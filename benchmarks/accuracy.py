@@ -1,14 +1,15 @@
-"""Odometry and loops against the truth, by the real program: how far off, is the covariance right, do loops help?
+"""Compare odometry and loops of the real program with the truth: errors, consistency of covariances, benefit of loops.
 
     python -m benchmarks.accuracy walks/*.mcap
     python -m benchmarks.accuracy walk.mcap --truth walk.tum --drifting
 
-`hemislam simulate --suite revisits --imperfect --every-block 6 --out walks` makes such walks; `--suite paper` others.
-Exits with 1 if a false loop was accepted, or if a trajectory is worse with loops than without by more than WORSE_M.
+`hemislam simulate --suite revisits --imperfect --every-block 6 --out walks` makes such walks; `--suite paper` makes
+others. The exit code is 1 if a false loop was accepted, or if a trajectory is worse with loops than without by more
+than WORSE_M.
 
-The NEES (normalised estimation error squared) of a keyframe is the square of its error in units of the covariance that
-the filter gives it; its mean for each degree of freedom is 1 if the covariance is right, and larger if the filter
-believes itself too much. Errors count from the first keyframe, whose pose defines the odometry frame.
+The NEES (normalised estimation error squared) of a keyframe is its squared error, normalised by the filter's
+covariance. Its mean per degree of freedom is 1 if the covariance is right, and larger if the filter is overconfident.
+Errors count from the first keyframe, whose pose defines the odometry frame.
 """
 
 import argparse
@@ -36,28 +37,28 @@ DRIFTING = (
     "filter.max_points=100", "filter.plane_tilt=20", "map.spacing=0.6", "map.points_per_voxel=10", "map.radius=12",
     "sensor.max_range=12",
 )  # fmt: skip
-"""So little of each scan that odometry drifts by decimetres, as it would on a worse sensor or a longer walk."""
+"""Uses so little of each scan that odometry drifts by decimetres, as with a worse sensor or on a longer walk."""
 SLIP_S, SLIP_DEG, SLIP_M = 5.0, 0.5, 0.2
-"""A slip: so much of an error gained within so many seconds, and kept."""
+"""A slip: an error that grows by this much within this many seconds, and stays."""
 KEPT = 10
-"""Frames over which errors are averaged for that: a wrong mounting and a late clock make them swing with every step."""
+"""Errors are averaged over this many frames to detect slips: a wrong mounting or clock makes them swing every step."""
 FALSE_M, FALSE_DEG = 0.5, 5.0
-"""A loop farther than this from the truth is false: it ties another place, and is not merely inexact."""
+"""A loop farther than this from the truth is false: it ties a different place and is not merely inaccurate."""
 GOOD_M, GOOD_DEG = 0.10, 0.5
-"""A revisit counts as found by a loop this near to the truth."""
+"""A loop this close to the truth counts as having found a revisit."""
 CLAIMED_M, CLAIMED_DEG = 0.2, 1.0
-"""A loop claims a direction, or an axis, if its standard deviation there is at most this: along a bare corridor it says
-itself that it may be off by decimetres, and roll and pitch are left to gravity."""
+"""A loop claims a direction or axis if its standard deviation there is at most this. Along a bare corridor, its own
+covariance admits errors of decimetres; roll and pitch are left to gravity."""
 WITHIN_M, APART_S, ALONG = 2.0, 15.0, 0.7
-"""A revisit: so near to where the walk was so long before, heading the same way or the opposite one (cosine)."""
+"""A revisit: this near to an earlier position, this long after it, in the same or the opposite direction (cosine)."""
 WORSE_M = 0.002
 
 
 @dataclass(frozen=True)
 class Walk:
     """Attributes:
-    odometry: of all frames. trajectory: in the map. T_odom_imu, T_imu_lidar: (k, 4, 4) of keyframes; covariances:
-        (k, 6, 6), rotation first; stamps_ns: (k,). edges: all candidates.
+    odometry: of all frames. trajectory: in the map. T_odom_imu, T_imu_lidar: (k, 4, 4) of keyframes. covariances:
+        (k, 6, 6), rotation first. stamps_ns: (k,). edges: all candidates.
     """
 
     odometry: Trajectory
@@ -72,11 +73,11 @@ class Walk:
 @dataclass(frozen=True)
 class Score:
     """Attributes:
-    metres: walked. without, beside: ATE, m, of odometry and with loops.
-    gained_m, gained_deg: the largest gains of error within SLIP_S.
-    yaw, position: mean NEES for each degree of freedom.
-    revisits: keyframes at which there is something to find; found: those of them with a loop that is good.
-    errors: (n, 2) of the accepted loops, m and deg. candidates: loops in all.
+    metres: walked. without, beside: ATE, m, without and with loops.
+    gained_m, gained_deg: the largest growth of the error within SLIP_S.
+    yaw, position: mean NEES per degree of freedom.
+    revisits: number of keyframes with a revisit. found: number of these with a good loop.
+    errors: (n, 2) of the accepted loops, m and deg. candidates: number of all loops.
     """
 
     metres: float
@@ -109,7 +110,7 @@ class Score:
 
 
 def measure(recording: Path, truth_path: Path | None, params: Params) -> Score:
-    """Run with loops, and hold odometry and loops against the truth. Loops do not change the odometry."""
+    """Run with loops, and compare odometry and loops with the truth. Loops do not change the odometry."""
     truth = truth_path or truth_beside(recording)
     if truth is None:
         sys.exit(f"{recording} has no truth beside it; name one with --truth.")
@@ -172,9 +173,9 @@ def score(walk: Walk, truth: Trajectory) -> Score:
 
 
 def _by_the_last_mounting(walk: Walk) -> Trajectory:
-    """Odometry with the IMU where the last mounting puts it on the LiDAR.
+    """Odometry of the IMU, with the final estimate of the mounting.
 
-    While the mounting is learnt, the IMU's pose turns with it, and no point of the map moves.
+    While the mounting is estimated, the IMU's pose rotates with it, but no point of the map moves.
     """
     last = np.searchsorted(walk.stamps_ns, walk.odometry.stamps_ns, side="right") - 1
     T_imu_lidar = walk.T_imu_lidar[np.maximum(last, 0)]
@@ -183,7 +184,7 @@ def _by_the_last_mounting(walk: Walk) -> Trajectory:
 
 
 def _by_the_last_mounting_between(walk: Walk, edge: LoopEdge) -> LoopEdge:
-    """The loop between IMUs where the last mounting puts them. Scans tell the LiDAR's motion, whatever the mounting."""
+    """The loop between IMU poses with the final mounting. Scans measure the LiDAR's motion, whatever the mounting."""
     T_lidars = lie.inverse(walk.T_imu_lidar[edge.older]) @ edge.T_older_newer @ walk.T_imu_lidar[edge.newer]
     return replace(edge, T_older_newer=walk.T_imu_lidar[-1] @ T_lidars @ lie.inverse(walk.T_imu_lidar[-1]))
 
@@ -191,8 +192,8 @@ def _by_the_last_mounting_between(walk: Walk, edge: LoopEdge) -> LoopEdge:
 def _errors(odometry: Trajectory, truth: Trajectory, first_ns: int, R_truth_odom: F64) -> tuple[I64, F64, F64]:
     """Stamps (n,) and errors in yaw (n,) rad and position (n, 3) m since the first keyframe.
 
-    The truth is turned into odom by the alignment of all positions. The first pose alone would not do: an error of
-    the mounting turns the whole walk about it.
+    The truth is rotated into odom by aligning all positions. Aligning only the first pose would not suffice: an error
+    of the mounting rotates the whole walk about it.
     """
     ours, theirs = paired(odometry, truth)
     true = R_truth_odom.T @ theirs.poses[:, :3]
@@ -203,7 +204,7 @@ def _errors(odometry: Trajectory, truth: Trajectory, first_ns: int, R_truth_odom
 
 
 def _nees(turned: F64, moved: F64, poses: F64, covariances: F64) -> tuple[float, float]:
-    """Means for yaw and for position, for each degree of freedom, without the first keyframe."""
+    """Mean NEES of yaw and of position per degree of freedom, without the first keyframe."""
     up = poses[:, 2, :3]
     yaw = turned**2 / np.einsum("ni,nij,nj->n", up, covariances[:, :3, :3], up)
     position = np.einsum("ni,nij,nj->n", moved, np.linalg.inv(covariances[:, 3:, 3:]), moved) / 3
@@ -211,7 +212,7 @@ def _nees(turned: F64, moved: F64, poses: F64, covariances: F64) -> tuple[float,
 
 
 def _gains(stamps_ns: I64, turned: F64, moved: F64) -> tuple[float, float]:
-    """The largest gains of error within SLIP_S, in m and deg. What ends nearer to the truth is a correction."""
+    """The largest growth of the error within SLIP_S, in m and deg. A change towards the truth is a correction."""
     mean = np.full(KEPT, 1 / KEPT)
     errors = [np.stack([np.convolve(axis, mean, "valid") for axis in e.T], axis=1) for e in (moved, turned[:, None])]
     stamps_ns = stamps_ns[KEPT - 1 :]
@@ -224,7 +225,7 @@ def _gains(stamps_ns: I64, turned: F64, moved: F64) -> tuple[float, float]:
 
 
 def _loop_error(edge: LoopEdge, older: F64, newer: F64) -> tuple[float, float]:
-    """m and deg between a loop and the true poses (4, 4) of its ends, in the directions that it claims."""
+    """Error (m and deg) of a loop given the true poses (4, 4) of its ends, in the directions that it claims."""
     wrong = lie.inverse(lie.inverse(older) @ newer) @ edge.T_older_newer
     turned = _claimed(edge.covariance[:3, :3], np.radians(CLAIMED_DEG)) @ lie.log(wrong[:3, :3])
     moved = _claimed(edge.covariance[3:, 3:], CLAIMED_M) @ wrong[:3, 3]
@@ -232,7 +233,7 @@ def _loop_error(edge: LoopEdge, older: F64, newer: F64) -> tuple[float, float]:
 
 
 def _claimed(covariance: F64, most: float) -> F64:
-    """(n, 3) unit directions in which a covariance (3, 3) has a standard deviation of at most so much."""
+    """(n, 3) unit directions in which a covariance (3, 3) has at most this standard deviation."""
     squares, directions = np.linalg.eigh(covariance)
     return np.asarray(directions[:, squares < most**2].T)
 
@@ -242,7 +243,7 @@ def _good(errors: F64) -> npt.NDArray[np.bool_]:
 
 
 def _revisits(T: F64, stamps_ns: I64) -> list[int]:
-    """Which of the true poses (n, 4, 4) come back to an earlier one."""
+    """Mask of the true poses (n, 4, 4) that return to an earlier one."""
     ahead = _ahead(T)
     out = []
     for k in range(len(T)):
@@ -254,7 +255,7 @@ def _revisits(T: F64, stamps_ns: I64) -> list[int]:
 
 
 def _ahead(T: F64) -> F64:
-    """(n, 3) unit, the way the walk goes at each pose."""
+    """(n, 3) unit, walking direction at each pose."""
     step = np.gradient(T[:, :3, 3], axis=0)
     return np.asarray(step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
 
@@ -295,7 +296,7 @@ def _summary(scores: Sequence[Score]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING")
-    parser.add_argument("--truth", type=Path, help="of the IMU, TUM; else RECORDING_truth.tum beside it")
+    parser.add_argument("--truth", type=Path, help="TUM file of the IMU; default: RECORDING_truth.tum beside it")
     parser.add_argument("--preset")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--drifting", action="store_true", help="odometry from a fraction of each scan")

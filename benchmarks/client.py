@@ -1,4 +1,4 @@
-"""A WebSocket client that is sent what a browser would be sent, and what it was sent."""
+"""A WebSocket client that receives the same messages as a browser, and decodes them."""
 
 import threading
 import time
@@ -18,10 +18,10 @@ PROTOCOL = f"viser-v{viser.__version__}"
 
 
 class Client:
-    """Messages as they came.
+    """The received messages.
 
     Attributes:
-        received: bytes so far. heard: monotonic time (s) and content of each message, if they are kept.
+        received: bytes so far. heard: monotonic time (s) and content of each message, if messages are kept.
     """
 
     def __init__(self) -> None:
@@ -29,9 +29,9 @@ class Client:
         self.heard: list[tuple[float, bytes]] = []
 
     def entries(self, first: int = 0) -> Iterator[tuple[float, dict[str, Any]]]:
-        """Time and content of the viser messages in the WebSocket messages from the `first` on.
+        """Time and content of the viser messages, from the WebSocket message number `first` on.
 
-        Arrays among the updates of a scene node are flat.
+        Arrays in the updates of a scene node are flat.
         """
         for at, raw in self.heard[first:]:
             for entry in _decoded(raw):
@@ -39,7 +39,7 @@ class Client:
 
 
 def _decoded(raw: bytes) -> list[dict[str, Any]]:
-    """The messages in one WebSocket message: zstd-compressed msgpack, then the arrays, each aligned to 8 bytes."""
+    """Decode a WebSocket message: zstd-compressed msgpack, then the arrays, each aligned to 8 bytes."""
     end = 16 + int.from_bytes(raw[8:16], "little")
     content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16:end]))
     arrays = []
@@ -57,7 +57,7 @@ def _decoded(raw: bytes) -> list[dict[str, Any]]:
 
 @contextmanager
 def listening(url: str, *, keep: bool = True) -> Iterator[Client]:
-    """A client of this server that reads everything. keep: what it read, too."""
+    """A client of this server that reads everything. keep: keep the messages."""
     client, ended = Client(), threading.Event()
 
     def listen() -> None:

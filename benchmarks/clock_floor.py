@@ -1,8 +1,8 @@
-"""The least standard deviation that any estimate of the clocks' offset can have, from fixes with Gaussian noise.
+"""Lower bound on the standard deviation of any estimate of the clock offset from fixes with Gaussian noise.
 
-Unknown are the offset, the map's rotation and its shift. The Cramér-Rao bound by noise takes the map for exact. The
-bound by noise and drift takes the map's errors for a random walk, of the rate that they truly have: an estimator that
-knew this rate, and so weighted slow and fast motion best, would reach it.
+The unknowns are the offset, and the rotation and translation of the map. The Cramér-Rao bound for noise assumes an
+exact map. The bound for noise and drift models the map's errors as a random walk with their true rate; an estimator
+that knew this rate, and so weighted slow and fast motion optimally, would reach it.
 """
 
 import numpy as np
@@ -14,11 +14,11 @@ from app.slam.types import F64
 
 STEP_S = 1e-3
 STRETCH = 80
-"""Poses between which drift is measured: 8 s of scans."""
+"""Drift is measured over this many poses: 8 s of scans."""
 
 
 def drift_rate(trajectory: Trajectory, truth: F64) -> float:
-    """Variance that errors of positions gain in each direction, m²/s. truth: (n, 3) m, where the poses truly are."""
+    """Growth of the variance of position errors in each direction, m²/s. truth: (n, 3) m, true positions."""
     T = umeyama(trajectory.positions, truth)
     off = trajectory.positions @ T[:3, :3].T + T[:3, 3] - truth
     seconds = (trajectory.stamps_ns[STRETCH:] - trajectory.stamps_ns[:-STRETCH]) * 1e-9
@@ -26,10 +26,10 @@ def drift_rate(trajectory: Trajectory, truth: F64) -> float:
 
 
 def least_sigma_s(walked: SmoothTrajectory, times: F64, lever: F64, noise: float, drift: float = 0.0) -> float:
-    """Of the offset by fixes at these times (n,), s, if nothing but noise (m) and drift (m²/s) is wrong.
+    """Bound (s) on the offset from fixes at times (n,), s, if noise (m) and drift (m²/s) are the only errors.
 
     Args:
-        walked: the true motion of the IMU. lever: (3,) m, from it to the antenna.
+        walked: the true motion of the IMU. lever: (3,) m, from the IMU to the antenna.
     """
 
     def antenna(t: F64) -> F64:
@@ -39,7 +39,7 @@ def least_sigma_s(walked: SmoothTrajectory, times: F64, lever: F64, noise: float
     at = antenna(times)
     velocity = (antenna(times + STEP_S) - antenna(times - STEP_S)) / (2 * STEP_S)
     arms = at - at.mean(axis=0)
-    turns = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)  # (n, 3, 3): change by each rotation
+    turns = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)  # (n, 3, 3): derivative by each rotation
     since = times - times[0]
     covariance = noise**2 * np.eye(len(times)) + drift * np.minimum.outer(since, since)
     information = np.zeros((7, 7))

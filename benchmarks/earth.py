@@ -1,8 +1,8 @@
-"""How well a map lies on Earth: simulated walks with a receiver of 2 cm, 80 ms late, a tenth of its fixes 5 m off.
+"""Accuracy of georeferenced maps: simulated walks; the receiver has 2 cm noise, 80 ms delay and 10 % outliers of 5 m.
 
-Every point of the map is compared with where it truly is in UTM, by the true poses, the scanner's true mounting and the
-place of the scene. The alignment knows only the fixes and the lever arm of 0.5 m. Errors of the clocks' offset stand
-beside the least that any estimate can have.
+Every point of the map is compared with its true position in UTM, computed from the true poses, the scanner's true
+mounting and the position of the scene. The alignment uses only the fixes and the lever arm of 0.5 m. The errors of the
+clock offset are listed with the lower bound of any estimate.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ from benchmarks.scenes import FOLDER
 LEVER = (0.1, -0.2, 0.447)
 GNSS = Gnss(rate=10.0, noise=0.02, offset=0.08, outliers=0.1, wild=5.0, x=LEVER[0], y=LEVER[1], z=LEVER[2])
 WALKS = (("outdoor", False), ("corridor", False), ("outdoor", True))
-"""Scenes, and whether scanner and hand have the errors of real ones."""
+"""Scenes, and whether scanner and hand are imperfect."""
 SECONDS, SEED, DRAWS = (90.0, 240.0), 5, 16
 
 
@@ -73,7 +73,7 @@ def measure(scene: str, seconds: float, *, imperfect: bool) -> list[Line]:
 
 
 def offsets(results: Results, walked: SmoothTrajectory, seconds: float, on: str) -> list[Line]:
-    """Errors of the clocks' offset over other draws of the receiver's noise, and the least they can be."""
+    """Errors of the clock offset for other draws of the receiver's noise, and their lower bound."""
     lines, found = [], {"align only": list[tuple[float, float]](), "as factors": list[tuple[float, float]]()}
     for draw in range(DRAWS):
         fixes = received(GNSS, walked, seconds, START_NS, np.random.default_rng(1000 + draw))
@@ -103,7 +103,7 @@ def offsets(results: Results, walked: SmoothTrajectory, seconds: float, on: str)
 
 
 def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str, T_imu_lidar: F64) -> list[Line]:
-    """Offset, points of the map and names of wild fixes against the truth. T_imu_lidar: (4, 4), the true one."""
+    """Compare offset, map points and outlier fixes with the truth. T_imu_lidar: (4, 4), true mounting."""
     found = results.found
     assert found is not None and results.where is not None
     off = np.concatenate([_off(results, truth, index, T_imu_lidar) for index in range(len(results.keyframes))])
@@ -121,7 +121,7 @@ def compare(results: Results, truth: Trajectory, fixes: Fixes, on: str, T_imu_li
 
 
 def _off(results: Results, truth: Trajectory, index: int, T_imu_lidar: F64) -> F64:
-    """(n,) m, how far each point of a keyframe is from where it truly is."""
+    """(n,) m, distance of each point of a keyframe from its true position."""
     keyframe = results.keyframes[index]
     there, inside = interpolate(truth, np.array([keyframe.stamp_ns]))
     if not inside.all() or results.where is None:
@@ -135,7 +135,7 @@ def _off(results: Results, truth: Trajectory, index: int, T_imu_lidar: F64) -> F
 
 
 def _wild(fixes: Fixes, truth: Trajectory) -> set[str]:
-    """Names of the fixes that are farther than 1 m from where the antenna truly was."""
+    """Names of the fixes more than 1 m from the true position of the antenna."""
     poses, inside = interpolate(truth, fixes.stamps_ns - round(GNSS.offset * 1e9))
     T = poses.poses
     antenna = GNSS.reference.to_geographic(T[:, :3, :3] @ np.array(LEVER) + T[:, :3, 3])

@@ -1,4 +1,4 @@
-"""Points per second, size and memory of exports of a made-up map."""
+"""Points per second, size and memory of exports of a synthetic map."""
 
 import tempfile
 import time
@@ -16,17 +16,17 @@ from app.slam.types import Cloud, Keyframe
 from benchmarks.record import Line
 
 POINTS = 57_632
-"""Of a full revolution of an RS-Bpearl."""
+"""Points of a full revolution of an RS-Bpearl."""
 KEYFRAMES = 347
 """20 million points."""
 FORMATS = ("laz", "las", "e57", "ply")
 RUNS = 3
 LARGE = 1736
-"""100 million points; once, as LAZ."""
+"""100 million points; exported once, as LAZ."""
 
 
 class Walk:
-    """Keyframes along a street, a metre apart, from one scan of its ground and walls with 1 cm noise."""
+    """Keyframes along a street, a metre apart, all made from one scan of ground and walls with 1 cm noise."""
 
     def __init__(self, count: int) -> None:
         self._count, rng = count, np.random.default_rng(1)
@@ -74,5 +74,5 @@ def _measure(kind: str, keyframes: int) -> tuple[float, float, float]:
 
 
 def _resident_mb() -> float:
-    """Memory of this process now; Linux only."""
+    """Present memory of this process; Linux only."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6

@@ -1,8 +1,8 @@
-"""A recording fed in real time, as packets and through Foxglove: how far the trajectory is from that of the file.
+"""A recording fed in real time, as packets and through Foxglove: how far its trajectory is from that of the file.
 
-A separate process feeds the whole recording. The position of each frame in the final map is compared with that of the
-same engine on the file, matched by the scans' end times; nothing is aligned. `HEMISLAM_PRESET` names the device; files
-beside the recording apply as usual.
+A separate process feeds the whole recording. The position of each frame in the final map is compared with the result of
+the same engine on the file. Frames are matched by the scans' end times, and nothing is aligned. `HEMISLAM_PRESET` names
+the device; files beside the recording apply as usual.
 """
 
 import math
@@ -30,9 +30,9 @@ from benchmarks.record import Line
 SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
 PRESET = os.environ.get("HEMISLAM_PRESET")
 SAME_NS = 10_000
-"""Scans whose ends are this near are the same scan; packets hold whole microseconds."""
+"""Scans whose end times differ by at most this are the same scan; packets hold whole microseconds."""
 TIMEOUT_S, SILENT_S = 60.0, 3.0
-"""It gives up after this time without news, and waits this long after the last message was sent."""
+"""The benchmark gives up after this time without news, and waits this long after the last message was sent."""
 
 
 def run(recording: Path | None = None) -> list[Line]:
@@ -66,7 +66,7 @@ def run(recording: Path | None = None) -> list[Line]:
 
 
 def _fed(recording: Path, params: Params, url: str, imu: str | None) -> Snapshot | str:
-    """The final snapshot of a live session fed with it, or why it cannot be fed this way."""
+    """The final snapshot of a live session fed with the recording, or why it cannot be fed this way."""
     with TemporaryDirectory() as folder, LiveProcess(url, params, imu) as source:
         setup = Setup(LIVE, params=params, play=True, speed=math.inf, live=source.address, live_folder=Path(folder))
         with closing(EngineProcess(setup)) as engine:
@@ -81,7 +81,7 @@ def _fed(recording: Path, params: Params, url: str, imu: str | None) -> Snapshot
 
 
 def _positions(snapshot: Snapshot) -> tuple[I64, F64]:
-    """Ends of the scans (n,), ns, and positions of the IMU in the map at these times (n, 3), m."""
+    """End times of the scans (n,), ns, and positions of the IMU in the map at these times (n, 3), m."""
     assert snapshot.recording is not None
     stamps = snapshot.recording.start_ns + np.round(snapshot.series["stamp_s"] * 1e9)
     known = np.isfinite(stamps)

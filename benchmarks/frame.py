@@ -1,4 +1,4 @@
-"""One frame of 57,632 firings and of a sixth of them, stage by stage, and reading it from the file."""
+"""Times of one frame with 57,632 firings and with a sixth of them, stage by stage, and of reading it from the file."""
 
 import time
 from dataclasses import replace
@@ -23,10 +23,10 @@ def run() -> list[Line]:
 
 
 def measure(path: Path, name: str, every: int = 1) -> list[Line]:
-    """Reading and every stage in ms, over the frames on which the filter was at work.
+    """Time of reading and of every stage in ms, over the frames in which the filter ran.
 
     Args:
-        every: use every so many-th block of firings only.
+        every: use only every k-th block of firings.
     """
     params = resolve_params(path, None, None, [])
     engine = Engine(params)

@@ -1,9 +1,9 @@
-"""kill -9 at 20 random moments, of server, engine, both or loop search: the session still reaches the same result.
+"""kill -9 of server, engine, both or loop search at 20 random moments: the session still reaches the same result.
 
 A simulated user works over REST with the real program, on a recording with loops: seeks, changes parameters, writes
-notes, edits loops. After a kill, everything done more than a second before it must still be there; what was done
-last is done again if it is missing. At the end, map and trajectory must equal those of a session that was never
-killed, byte for byte.
+notes, edits loops. After a kill, everything done more than a second before it must still be there; later actions are
+repeated if they are missing. At the end, map and trajectory must equal those of a session that was never killed, byte
+for byte.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from benchmarks.record import Line
 SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
 KILLS, KILLS_A_RUN = 20, 5
 LOSS_S = 1.0
-"""An action may be lost only if it was done this short a time before the kill."""
+"""An action may be lost only if it was done within this time before the kill."""
 TIMEOUT_S = 900.0
 FILES = ("trajectory.tum", "map.ply")
 Kind = Literal["engine", "loops", "server", "both"]
@@ -40,7 +40,7 @@ State = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """What the user does at a share of the recording (1: at its end). `done` asks the server whether it was done."""
+    """An action of the user at a share of the recording (1: at its end). `done` asks the server whether it was done."""
 
     at: float
     act: Callable[["Workbench"], None]
@@ -109,13 +109,13 @@ class Workbench:
         return any("cannot" in notice["text"] and notice["level"] == "error" for notice in state["notices"])
 
     def ready(self) -> State:
-        """The state of the session, once it is at a frame."""
+        """Wait until the session is at a frame, and return its state."""
         return self.until(
             lambda s: s["recording"] is not None and s["progress"] is None and s["transport"]["frame"] >= 0
         )
 
     def go_to(self, frame: int) -> None:
-        """Seek to a frame; asks again in case the engine died before it got the command."""
+        """Seek to a frame; repeat the request in case the engine died before it got the command."""
         deadline = time.monotonic() + TIMEOUT_S
         while True:
             self.ask("POST", "transport", json={"action": "seek", "frame": frame})
@@ -167,7 +167,7 @@ class Workbench:
 
 # --- what the user does --------------------------------------------------------------------------
 def _sets(at: float, **values: float) -> Action:
-    """Parameters of one section and name, written section__name."""
+    """Set parameters, given as section__name."""
     tree: dict[str, dict[str, float]] = {}
     for path, value in values.items():
         section, name = path.split("__")
@@ -194,12 +194,12 @@ def _notes(at: float, text: str) -> Action:
 
 
 def _edits_loop(at: float, number: int, word: str, **more: float) -> Action:
-    """Edit the accepted loop of this number, ordered by keyframes."""
+    """Edit the accepted loop with this number in the order of keyframes."""
     chosen = list[tuple[int, int]]()
 
     def pair(bench: Workbench) -> tuple[int, int]:
         found, before, deadline = list[State](), list[State](), time.monotonic() + TIMEOUT_S
-        while not chosen and (len(found) <= number or found != before):  # they may still arrive
+        while not chosen and (len(found) <= number or found != before):  # loops may still arrive
             assert time.monotonic() < deadline, "there is no such loop to edit; choose another recording"
             time.sleep(1.0)
             before, loops = found, bench.ask("GET", "loops").json()["loops"]
@@ -233,7 +233,7 @@ ACTIONS = (
 
 
 def work_through(bench: Workbench, moments: "list[tuple[float, Kind]]") -> dict[str, bytes]:
-    """Do all actions while processes are killed, each a time (s) after the session was ready. Returns the results."""
+    """Do all actions while processes are killed, each a given time (s) after the session is ready. Returns results."""
     index, when = 0, [0.0] * len(ACTIONS)
     killed_at, killed, waiting = [0.0], threading.Event(), list(moments)
     last = int(bench.ready()["recording"]["frames"]) - 1
@@ -272,7 +272,7 @@ def work_through(bench: Workbench, moments: "list[tuple[float, Kind]]") -> dict[
 
 
 def _what_is_left(bench: Workbench, index: int, when: list[float], killed_at: float) -> int:
-    """The first action that was lost, to go on with. None may be lost that was done long before the kill."""
+    """The first lost action, from which to continue. No action done long before the kill may be lost."""
     for number, action in enumerate(ACTIONS[:index]):
         deadline = time.monotonic() + 20.0  # loops are published a little after the frame
         while not (done := action.done(bench)) and time.monotonic() < deadline:

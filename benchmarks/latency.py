@@ -1,7 +1,7 @@
-"""Time from the last packet of a scan to its pose, and to the page; and how soon a killed engine maps again.
+"""Time from a scan's last packet to its pose and to the page, and time until a killed engine maps again.
 
-A process of its own sends a walk at the sensor's full resolution as packets in real time. A pose has arrived when the
-server's process has it. It has reached the page when a WebSocket client was sent the sensor's position.
+A separate process sends a walk at the sensor's full resolution as packets in real time. A pose counts as arrived when
+the server's process has it, and as shown when a WebSocket client has been sent the sensor's position.
 """
 
 import math
@@ -38,9 +38,9 @@ from benchmarks.scenes import recording
 
 SCENE = "corridor"
 RUNS, KILLS = 4, 3
-"""Runs with kills, and kills in each run. A kill follows as soon as the engine maps again."""
+"""Number of runs with kills, and of kills in each run. The next kill follows as soon as the engine maps again."""
 SAME_M = 1e-4
-"""Both runs give the same poses, apart from 32-bit numbers in viser's messages."""
+"""Tolerance: both runs give the same poses, except for the 32-bit rounding in viser's messages."""
 
 
 def run() -> list[Line]:
@@ -62,7 +62,7 @@ def run() -> list[Line]:
 
 
 def _to_poses(walk: Path) -> tuple[list[float], dict[int, F64]]:
-    """Seconds for each scan until the server's process has its pose, and positions by the scan's end."""
+    """Seconds until the server's process has the pose of each scan, and positions by the scans' end times."""
     came: dict[int, float] = {}
     with received(walk) as (engine, sending):
         while not sending.ended or time.monotonic() - sending.last < 1.0:
@@ -76,7 +76,7 @@ def _to_poses(walk: Path) -> tuple[list[float], dict[int, F64]]:
 
 
 def _to_page(walk: Path, positions: dict[int, F64]) -> list[float]:
-    """Seconds for each scan until an open page was sent its position. positions: of all scans, by their ends."""
+    """Seconds until an open page was sent the position of each scan. positions: of all scans, by their end times."""
     stamps, places = np.array(list(positions)), np.array(list(positions.values()))
     came: dict[int, float] = {}
     with TemporaryDirectory() as folder, served(walk, Path(folder) / "live.mcap") as (url, _, packets, imu):
@@ -94,7 +94,7 @@ def _to_page(walk: Path, positions: dict[int, F64]) -> list[float]:
 
 @dataclass(frozen=True, slots=True)
 class _Killed:
-    """Seconds from each kill to the next frame, and how much of what was received is not recorded, lost, dropped."""
+    """Seconds from each kill to the next frame, and how much of the received data was not recorded, lost or dropped."""
 
     seconds: list[float]
     not_recorded: int
@@ -137,14 +137,14 @@ def _until(engine: EngineProcess, wanted: Any) -> Snapshot:
     snapshot = engine.snapshot
     while not wanted(snapshot):
         if time.monotonic() > deadline:
-            raise RuntimeError(f"the engine does not go on: {snapshot.notices}")
+            raise RuntimeError(f"the engine does not continue: {snapshot.notices}")
         snapshot = engine.wait(snapshot.revision, timeout=0.1)
     return snapshot
 
 
 # --- the sensor ----------------------------------------------------------------------------------
 class Sending:
-    """Sends a walk in a process of its own, which reports when each LiDAR packet was sent."""
+    """Sends a walk from a separate process, which reports when each LiDAR packet was sent."""
 
     def __init__(self, walk: Path, packets: str, imu: str) -> None:
         context = multiprocessing.get_context("spawn")
@@ -167,7 +167,7 @@ class Sending:
         self.ended = True
 
     def delays(self, came: dict[int, float]) -> list[float]:
-        """Seconds from the last packet of each scan to its arrival. came: monotonic s, by the ends of scans."""
+        """Seconds from the last packet of each scan to its arrival. came: monotonic s, by the scans' end times."""
         stamps = np.array([stamp for stamp, _ in self._sent])
         last = np.searchsorted(stamps, np.array(list(came)), side="right") - 1
         return [at - self._sent[index][1] for index, at in zip(last, came.values(), strict=True)]
@@ -178,7 +178,7 @@ class Sending:
 
 
 def _send(walk: Path, packets: str, imu: str, told: Any, go: Event) -> None:
-    """The process. It makes all packets first, so that nothing delays them."""
+    """The process: makes all packets in advance, so that nothing delays them."""
     with open_recording(walk, resolve_params(walk, None, None, [])) as opened:
         made = list(packets_of(opened))
     ports = (*parse_address(packets).ports, *parse_address(imu).ports)
@@ -207,7 +207,7 @@ def sent(walk: Path, packets: str, imu: str) -> Iterator[Sending]:
 
 @contextmanager
 def received(walk: Path, record: Path | None = None) -> Iterator[tuple[EngineProcess, Sending]]:
-    """An engine's process without a page that maps the packets sent."""
+    """An engine's process, without a page, that maps the packets."""
     ports = [free_port() for _ in range(3)]
     packets, imu = f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"
     params = resolve_params(walk, None, None, [])

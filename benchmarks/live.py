@@ -1,8 +1,8 @@
-"""Live mapping for minutes: a walk sent as packets, with three pages open, one of them stalled.
+"""Live mapping for several minutes: a walk sent as packets, with three open pages, one of them stalled.
 
-Prints memory and dropped scans every half minute. The budget of an hour is `BUDGET_MB` in all processes together, and
-no scan dropped. The pages are WebSocket clients that are sent what a browser would be sent; the stalled one never
-reads. Environment variables: `HEMISLAM_LIVE_MINUTES` (4) and `HEMISLAM_LIVE_SPEED` (1). Up to eight minutes the walk
+Prints memory and dropped scans every half minute. The limits for an hour are `BUDGET_MB` in all processes together, and
+no dropped scans. The pages are WebSocket clients that receive the same messages as a browser; the stalled one never
+reads. Environment variables: `HEMISLAM_LIVE_MINUTES` (4) and `HEMISLAM_LIVE_SPEED` (1). A walk of up to eight minutes
 goes round a building; a longer one covers new ground outdoors, or stays in the building with `HEMISLAM_LIVE_LAPS=1`.
 """
 
@@ -30,14 +30,14 @@ from benchmarks.scenes import half_hour_in_laps, outdoors, walk_in_laps
 
 MINUTES = float(os.environ.get("HEMISLAM_LIVE_MINUTES", "4"))
 SPEED = float(os.environ.get("HEMISLAM_LIVE_SPEED", "1"))
-"""Times real time: at 2, twenty scans a second."""
+"""Multiple of real time; 2 is twenty scans per second."""
 LAPS = os.environ.get("HEMISLAM_LIVE_LAPS", "0") != "0"
 BUDGET_MB = 1500
 REPORT_S = 30.0
 NAMED = "hemislam-"
-"""How the names of the processes that the server starts begin."""
+"""Prefix of the names of the processes that the server starts."""
 SETTLE_S = 3.0
-"""After the last packet. By then all scans are mapped and shown."""
+"""Time after the last packet within which all scans are mapped and shown."""
 
 
 def run() -> list[Line]:
@@ -51,7 +51,7 @@ def run() -> list[Line]:
         wait_until(url, lambda state: state["transport"]["frame"] >= 20 and state["live"])
         memory: list[dict[str, float]] = []
         with listening(url, keep=False) as first, listening(url, keep=False) as second, _stalled_page(url):
-            time.sleep(5.0)  # the loops' process has begun too
+            time.sleep(5.0)  # the process of the loop search has also begun
             begin = time.monotonic()
             while (passed := time.monotonic() - begin) < 60 * MINUTES:
                 memory.append(_memory(server))
@@ -82,7 +82,7 @@ def run() -> list[Line]:
 
 
 def _feed(walk: Path, packets: str, imu: str, ended: threading.Event) -> None:
-    """Send packets until the time or the walk is over."""
+    """Send packets until the time is over or the walk has ended."""
     feed(
         walk,
         resolve_params(walk, None, None, []),
@@ -93,7 +93,7 @@ def _feed(walk: Path, packets: str, imu: str, ended: threading.Event) -> None:
 
 
 def _stalled_page(url: str) -> socket.socket:
-    """Opens the page's WebSocket and then reads nothing."""
+    """Opens the page's WebSocket and then reads nothing from it."""
     host, port = url.removeprefix("http://").rstrip("/").split(":")
     page = socket.socket()
     page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
@@ -107,9 +107,9 @@ def _stalled_page(url: str) -> socket.socket:
 
 
 def _memory(server: "subprocess.Popen[str]") -> dict[str, float]:
-    """MB that the server and each process that it started have written. Linux only.
+    """Memory (MB) written by the server and by each process that it started. Linux only.
 
-    Shared memory is divided among the processes that share it. Pages of libraries do not count.
+    Shared memory is divided among the processes that share it. Memory pages of libraries do not count.
     """
     found = {"server": _written_mb(server.pid)}
     for pid in children(server.pid):
@@ -148,7 +148,7 @@ def _state(url: str) -> Any:
 
 
 def wait_until(url: str, wanted: Callable[[Any], object]) -> None:
-    """Wait until the state is as wanted. The engine may have to be compiled first."""
+    """Wait until the state meets a condition. The engine may have to be compiled first."""
     deadline = time.monotonic() + 300
     while not wanted(state := _state(url)):
         if time.monotonic() > deadline:
@@ -158,7 +158,7 @@ def wait_until(url: str, wanted: Callable[[Any], object]) -> None:
 
 @contextmanager
 def served(walk: Path, record: Path) -> Iterator[tuple[str, "subprocess.Popen[str]", str, str]]:
-    """The workbench on live packets: its address, its process, and the addresses for packets and IMU samples."""
+    """Start the workbench on live packets: its address, its process, and the addresses for packets and IMU samples."""
     ports = [free_port() for _ in range(3)]
     packets, imu = f"rsbpearl://127.0.0.1:{ports[0]},{ports[1]}", f"imu-udp://127.0.0.1:{ports[2]}"
     params = walk.with_suffix(".params.yaml")

@@ -1,4 +1,4 @@
-"""A click on a map of 3 million points to its coordinates on the page, and two maps of a million points compared."""
+"""Time from a click on a map of 3 million points to its coordinates on the page; comparing two maps of a million."""
 
 import time
 from dataclasses import replace
@@ -28,7 +28,7 @@ EYE = np.array([90.0, -30.0, 20.0])
 
 
 class _Engine:
-    """Keeps what is measured at once, and does nothing else."""
+    """Keeps measures at once, and does nothing else."""
 
     engine_alive = True
 
@@ -86,7 +86,7 @@ def _clicks(rng: np.random.Generator) -> list[float]:
         workbench.start()
         with listening(f"http://127.0.0.1:{server.get_port()}/") as page:
             _until(lambda: workbench._scene.chunks.points > 0)
-            time.sleep(15.0)  # until the page has all of it
+            time.sleep(15.0)  # until the page has received everything
             for number in range(CLICKS):
                 workbench._measure.begin(POINT)
                 aim = np.array([60.0 + 3 * number, 0.0, -1.2]) - EYE
@@ -101,7 +101,7 @@ def _clicks(rng: np.random.Generator) -> list[float]:
 
 
 def _label(page: Any, heard: int, number: int) -> float:
-    """When the page was sent the label of this measure."""
+    """Time at which the page was sent the label of this measure."""
     deadline = time.monotonic() + 30.0
     while time.monotonic() < deadline:
         for at, message in page.entries(heard):

@@ -1,4 +1,4 @@
-"""Loops: one update of a large pose graph, and what a keyframe costs the loop search on a walk of 1,000."""
+"""Loops: one update of a large pose graph, and the loop search's time per keyframe on a walk with 1,000 keyframes."""
 
 import time
 from pathlib import Path
@@ -33,7 +33,7 @@ def run() -> list[Line]:
 
 
 def _garage() -> list[Line]:
-    """parking-garage.g2o pose by pose: every update, and how far the end is from the batch optimum."""
+    """parking-garage.g2o pose by pose: time of every update, and distance of the final cost from the batch optimum."""
     first, odometry, loops, start = read_g2o(GARAGE)
     graph, times = PoseGraph(first), []
     for factor in tqdm(odometry, desc=GARAGE.stem, unit=" poses", leave=False, disable=None):
@@ -53,7 +53,7 @@ def _garage() -> list[Line]:
 
 
 def read_g2o(path: Path) -> tuple[F64, list[Factor], list[Factor], F64]:
-    """The first pose (4, 4), odometry and loops as factors from older to newer, and the poses of the file (n, 4, 4)."""
+    """First pose (4, 4), odometry and loops as factors from older to newer poses, and the file's poses (n, 4, 4)."""
     read, values = gtsam.readG2o(str(path), True)
     odometry: dict[int, Factor] = {}
     loops = []
@@ -74,7 +74,7 @@ def read_g2o(path: Path) -> tuple[F64, list[Factor], list[Factor], F64]:
 
 
 def _search() -> list[Line]:
-    """The loop search beside a walk in laps, every keyframe, on one thread; and undoing at its end."""
+    """The loop search on a walk in laps, for every keyframe, on one thread; and undoing edits at its end."""
     path = walk_in_laps()
     params = resolve_params(path, None, None, [])
     keyframes = _keyframes(path, params)

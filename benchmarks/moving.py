@@ -1,8 +1,8 @@
-"""How well points on what moves are found: on simulated walks among people, and on the same walks without anyone.
+"""Detection of points on moving objects: simulated walks among people, and the same walks without people.
 
-A point is on a person if it lies within 8 cm of the body where that was when the point was measured, and still if no
-body was within 25 cm; those in between, mixed pixels most of them, count for neither. Only keyframes, only points
-within 20 m. Seed 3 was not looked at while the method was built.
+A point is on a person if it lies within 8 cm of a body at the time of its measurement, and still if no body was within
+25 cm. Points in between, most of them mixed pixels, do not count. Only points of keyframes within 20 m are used. Seed 3
+was not used during development of the method.
 """
 
 import time
@@ -32,7 +32,7 @@ SCENES = ("corridor", "outdoor")
 DURATION_S, RATE_HZ, EVERY_BLOCK = 30.0, 10, 4
 ON, OFF, REACH = 0.08, 0.25, 20.0
 DEVICE = SCANNERS["bpearl"]
-_O3D: Any = open3d  # its stubs know no arrays
+_O3D: Any = open3d  # its stubs lack arrays
 
 
 def run() -> list[Line]:
@@ -50,7 +50,7 @@ def run() -> list[Line]:
 
 
 def _among_people(scene: str, sizes: Imperfections, seed: int, times: list[float]) -> tuple[float, float, float]:
-    """Recall, precision and the share of still points that are labelled."""
+    """Recall, precision, and the share of still points that are labelled."""
     walk = _Walk(scene, sizes, seed, people=True)
     called, on, off = (np.concatenate(parts) for parts in zip(*walk.judged(times), strict=True))
     right, wrong, there, still = (int(np.count_nonzero(mask)) for mask in (called & on, called & off, on, off))
@@ -64,7 +64,7 @@ def _alone(scene: str, sizes: Imperfections, seed: int) -> float:
 
 
 class _Walk:
-    """A walk through a scene as the engine saw it. people: with those of the scene and the operator's companions."""
+    """A walk through a scene, processed by the engine. people: include those of the scene and companions."""
 
     def __init__(self, scene: str, sizes: Imperfections, seed: int, *, people: bool) -> None:
         place, walker = build_scene(scene, seed), livelier(Walker(), sizes.hand)
@@ -83,7 +83,7 @@ class _Walk:
         self.keyframes = _keyframes([scan for scan in scans if len(scan)], _imu(self._trajectory, self._unit, seed))
 
     def judged(self, times: list[float]) -> list[tuple[Mask, Mask, Mask]]:
-        """Of each keyframe's points within reach: whether it is labelled, on a person, and far from all."""
+        """For each keyframe's points within reach: whether a point is labelled, on a person, and far from everyone."""
         sights, found = [moving.sight(one) for one in self.keyframes], []
         for index, one in enumerate(self.keyframes):
             begin = time.process_time()
@@ -94,10 +94,10 @@ class _Walk:
         return found
 
     def _distance(self, keyframe: Keyframe) -> F64:
-        """(n,) m, how far each point is from the nearest person, where he was at its time."""
+        """(n,) m, distance of each point from the nearest person at the time of the point."""
         cloud, end = keyframe.cloud, keyframe.stamp_ns - START_NS
         points = cloud.points.astype(np.float64)
-        if self._unit is not None:  # as the scanner is mounted, not as is written
+        if self._unit is not None:  # by the true mounting, not the written one
             points = self._unit.fired(np.ones_like(points), points)[1]
         (p,), (R,) = self._trajectory.poses(seconds(np.array([end])))
         world = (points @ DEVICE.lidar.R_imu_lidar.T + DEVICE.lidar.p_imu_lidar) @ R.T + p
@@ -113,7 +113,7 @@ class _Body:
         self._scene.add_triangles(_O3D.core.Tensor(mover.mesh.vertices), faces)
 
     def distance(self, points: F64, times: F64) -> F64:
-        """(n,) m from points (n, 3) at times (n,) s; inf where that is far."""
+        """(n,) m, distances of points (n, 3) at times (n,) s; inf if large."""
         where, yaw = self.mover.pose(times)
         found, offset = np.full(len(points), np.inf), points - where
         near = np.flatnonzero(np.linalg.norm(offset, axis=1) < 3.0)

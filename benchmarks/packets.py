@@ -20,7 +20,7 @@ def run() -> list[Line]:
 
 
 def measure(model: Model) -> list[Line]:
-    """ms to put the packets of a revolution in order, and to decode it, if every firing has a return."""
+    """Times (ms) to put the packets of a revolution in order and to decode it, if every firing has a return."""
     assembler, decoder = Assembler(), Decoder(model=model)
     decoder.configure(Difop(calibration=ChannelAngles(model.elevations_deg, np.linspace(-1.0, 0.0, model.channels))))
     assembling: list[float] = []

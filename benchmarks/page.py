@@ -1,6 +1,6 @@
-"""The sample in the workbench with a page open: how fast it replays, and how soon a parameter relabels the points.
+"""The sample in the workbench with an open page: replay speed, and time until a changed parameter relabels the points.
 
-The page is a WebSocket client that is sent what a browser would be sent. Drawing in a browser is not measured.
+The page is a WebSocket client that receives the same messages as a browser. Drawing in a browser is not measured.
 """
 
 import socket
@@ -22,10 +22,10 @@ from benchmarks.record import Line
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "cloister.mcap"
 SCAN = "/map/sensor/lidar/scan"
 SETTLED = 60
-"""A frame after which every process has started."""
+"""By this frame, every process has started."""
 TRIALS = 15  # within the 84 seconds of the sample
 SOME_GROUND = 0.05
-"""The least share of ground points while ground is looked for."""
+"""The least share of ground points while ground segmentation is on."""
 
 
 def run() -> list[Line]:
@@ -34,7 +34,7 @@ def run() -> list[Line]:
 
 
 def _relabelling(server: httpx.Client, page: Client) -> Line:
-    """While playing at real time, from setting a parameter of the ground until the page was sent colours without it."""
+    """Delay, during playback at real time, from switching the ground off until the page was sent colours without it."""
     _transport(server, {"action": "play"})
     while _state(server)["transport"]["frame"] < SETTLED:
         time.sleep(0.1)
@@ -55,7 +55,7 @@ def _relabelling(server: httpx.Client, page: Client) -> Line:
 
 
 def _ground_shares(page: Client, first: int) -> Iterator[tuple[float, float]]:
-    """Time and share of ground points of every scan that was sent."""
+    """Time and share of ground points of every sent scan."""
     for at, entry in page.entries(first):
         if entry.get("name") == SCAN and "colors" in entry.get("updates", {}):
             colours = entry["updates"]["colors"].reshape(-1, 3)
@@ -67,7 +67,7 @@ def _look_for_ground(server: httpx.Client, enabled: bool) -> None:
 
 
 def _replay(server: httpx.Client) -> Line:
-    """From the start, as fast as possible."""
+    """Replay from the start, as fast as possible."""
     _transport(server, {"action": "pause"})
     _transport(server, {"action": "restart"})
     while _state(server)["transport"]["frame"] > 0:
@@ -95,7 +95,7 @@ def _transport(server: httpx.Client, action: Mapping[str, object]) -> None:
 
 @contextmanager
 def _served() -> Iterator[tuple[httpx.Client, str]]:
-    """A connection to a workbench on the sample, paused, in a process of its own, and its address."""
+    """A connection to a paused workbench on the sample, in a process of its own, and its address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

@@ -1,7 +1,7 @@
-"""Compare the ground alone with Patchwork++ from PyPI; odometries are compared by `hemislam evaluate --baseline`.
+"""Compare only the ground segmentation with Patchwork++ from PyPI; `hemislam evaluate --baseline` compares odometry.
 
-`make bench-peers` installs it into build/peers, which comes last on the path, and runs this. It gets the same deskewed,
-levelled clouds, the sensor's height, and its own defaults for the rest.
+`make bench-peers` installs it into build/peers, which is last on the path, and runs this. Patchwork++ gets the same
+deskewed, levelled clouds and the sensor's height; everything else keeps its defaults.
 """
 
 import argparse
@@ -30,7 +30,7 @@ def run(paths: list[Path], preset: str | None = None, duration_s: float | None =
 
 
 def _ground(path: Path, params: Params, duration_s: float | None) -> list[Line]:
-    """Patchwork++ and ours on the same deskewed, levelled clouds, against the labels in the recording."""
+    """Compare Patchwork++ and our method on the same deskewed, levelled clouds with the labels in the recording."""
     import pypatchworkpp
 
     settings = pypatchworkpp.Parameters()
@@ -72,11 +72,11 @@ def _ground(path: Path, params: Params, duration_s: float | None) -> list[Line]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Patchwork++ on the same recording.")
-    parser.add_argument("recordings", nargs="*", type=Path, help="else the simulated scenes of the benchmarks")
-    parser.add_argument("--preset", help="as of hemislam itself")
-    parser.add_argument("--duration", type=float, help="seconds of each recording; else all of it")
+    parser.add_argument("recordings", nargs="*", type=Path, help="default: the simulated scenes of the benchmarks")
+    parser.add_argument("--preset", help="as for hemislam itself")
+    parser.add_argument("--duration", type=float, help="seconds of each recording; default: all of it")
     given = parser.parse_args()
-    sys.path.append(str(FOLDER))  # last, so that hemislam's own versions of shared packages win
+    sys.path.append(str(FOLDER))  # last, so that hemislam's versions of shared packages take priority
     try:
         show(run(given.recordings or [recording(scene) for scene in SCENES], given.preset, given.duration))
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""A whole recording through the engine's process, as fast as it can, without a page."""
+"""A whole recording through the engine's process, as fast as possible, without a page."""
 
 import math
 import time
@@ -16,7 +16,7 @@ def run() -> list[Line]:
 
 
 def measure(scene: str) -> Line:
-    """How many times faster than real time."""
+    """Speed as a multiple of real time."""
     path = recording(scene)
     engine = EngineProcess(Setup(recording=path, params=resolve_params(path, None, None, []), speed=math.inf))
     try:

@@ -1,6 +1,6 @@
-"""Taken back to 50 random frames and gone on from each, with loops and parameter changes, against never stopped.
+"""Go back to 50 random frames and continue, with loops and parameter changes; compare with an uninterrupted run.
 
-Every file that is saved at the end must be the same, byte for byte; the first that is not ends the check.
+Every file saved at the end must be the same, byte for byte; the first difference ends the check.
 """
 
 import json
@@ -29,7 +29,7 @@ from benchmarks.record import Line
 SAMPLE = next((Path(__file__).resolve().parents[1] / "sample_data").glob("*.mcap"))
 FRAMES = 50
 BUDGET = 64 << 20
-"""Bytes of memory for checkpoints: few, so that most come back from disk."""
+"""Memory for checkpoints, bytes: so little that most are restored from disk."""
 CHANGES: tuple[Mapping[str, Any], ...] = (
     {"ground.sigma": 0.02},
     {"scan.voxel_size": 0.6, "filter.plane_tilt": 4.0},
@@ -37,15 +37,15 @@ CHANGES: tuple[Mapping[str, Any], ...] = (
     {"loops.drift_translation": 0.7},
     {"filter.max_iterations": 3, "ground.alpha": 35.0},
 )
-"""Made one after the other on the way, evenly over the recording."""
+"""Parameter changes, made one after another, evenly spread over the recording."""
 MOVES_WITH_TIME = ("timings_ms", "peak_memory_mb", "machine")
-"""What of report.json no two runs share."""
+"""Entries of report.json that differ between any two runs."""
 
 Plan = Mapping[int, Mapping[str, Any]]
 
 
 class Walk:
-    """A session on a recording, with loops in their own process."""
+    """A session on a recording, with loop search in its own process."""
 
     def __init__(self, path: Path) -> None:
         self.params = resolve_params(path, None, None, [])
@@ -64,7 +64,7 @@ class Walk:
         return session
 
     def do(self, command: Command) -> Snapshot:
-        """Until nothing is awaited any more."""
+        """Work until nothing is pending."""
         self.controller.handle(command)
         while (wait := self.controller.work()) is not None:
             time.sleep(wait)
@@ -74,7 +74,7 @@ class Walk:
         return self._fold.snapshot
 
     def on_to_the_end(self, plan: Plan) -> Snapshot:
-        """As if for the first time, changing parameters at the frames of the plan."""
+        """Play as if for the first time, changing parameters at the planned frames."""
         snapshot = self.do(SetParams({}))
         while not snapshot.transport.finished:
             here = snapshot.transport.frame
@@ -84,7 +84,7 @@ class Walk:
         return snapshot
 
     def saved(self, folder: Path) -> dict[str, bytes]:
-        """The files by name, less what no two runs share."""
+        """The files by name, without the entries that differ between any two runs."""
         assert not self.do(Save(folder)).saved[-1].error
         files = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "timings.csv"}
         report = json.loads(files["report.json"])
@@ -93,12 +93,12 @@ class Walk:
 
 
 def run(recording: Path | None = None, frames: int = FRAMES) -> list[Line]:
-    """Raises AssertionError: a run that was taken back ended otherwise."""
+    """Raises AssertionError: a run that went back ended differently."""
     path = recording or SAMPLE
     compile_kernels()
     walk = Walk(path)
     with tempfile.TemporaryDirectory(prefix="hemislam-rewind-") as folder:
-        total = walk.do(SetParams({})).recording.frames  # type: ignore[union-attr]  # it is open
+        total = walk.do(SetParams({})).recording.frames  # type: ignore[union-attr]  # a recording is open
         plan = {total * (k + 1) // (len(CHANGES) + 1): change for k, change in enumerate(CHANGES)}
         ended = walk.on_to_the_end(plan)
         expected = walk.saved(Path(folder) / "never_stopped")
@@ -120,7 +120,7 @@ def run(recording: Path | None = None, frames: int = FRAMES) -> list[Line]:
 
 
 def _chosen_at(frame: int, plan: Plan, first: Params) -> dict[str, Any]:
-    """All parameters of the plan as they were chosen when the walk came to a frame."""
+    """All planned parameters as they were chosen when the run reached a frame."""
     names = {name for change in plan.values() for name in change}
     chosen = {name: first.value(name) for name in names}
     for at, change in sorted(plan.items()):

@@ -1,4 +1,4 @@
-"""The recordings to measure on: simulated once, at the sensor's full resolution, and kept in build/."""
+"""The recordings for the benchmarks: simulated once, at the sensor's full resolution, and kept in build/."""
 
 from pathlib import Path
 
@@ -12,27 +12,27 @@ DURATION_S = 15.0
 
 
 def recording(scene: str) -> Path:
-    """A 15 s walk through the scene, 57,632 firings a scan."""
+    """A 15 s walk through the scene with 57,632 firings per scan."""
     return _simulated(f"{scene}.mcap", scene, DURATION_S, seed=1)
 
 
 def long_recording() -> Path:
-    """Ten minutes round and round a building, with one azimuth of 6, so that the file stays small."""
+    """Ten minutes of laps in a building, with every 6th azimuth, so that the file stays small."""
     return _simulated("long.mcap", "building", 600.0, seed=3, every_block=6)
 
 
 def walk_in_laps() -> Path:
-    """Eight minutes round and round a building, with one azimuth of 6: over 1,000 keyframes, most of them revisits."""
+    """Eight minutes of laps in a building, with every 6th azimuth: over 1,000 keyframes, most of them revisits."""
     return _simulated("laps.mcap", "building", 480.0, seed=3, every_block=6)
 
 
 def outdoors(minutes: int) -> Path:
-    """Outdoors with one azimuth of 6: 870 m of new ground in a quarter of an hour, then along the same way again."""
+    """Outdoors, with every 6th azimuth: 870 m of new ground in a quarter of an hour, then the same way again."""
     return _simulated(f"outdoors-{minutes}-min.mcap", "outdoor_3", 60.0 * minutes + 30.0, seed=7, every_block=6)
 
 
 def half_hour_in_laps() -> Path:
-    """Half an hour round and round a building, with one azimuth of 6: 2.2 km, nearly all of it revisits."""
+    """Half an hour of laps in a building, with every 6th azimuth: 2.2 km, nearly all of it revisits."""
     return _simulated("half-hour-in-laps.mcap", "building", 1830.0, seed=7, every_block=6)
 
 

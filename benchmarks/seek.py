@@ -1,4 +1,4 @@
-"""Going to any frame of a ten-minute recording with loops, and what being able to costs while it plays."""
+"""Time to go to any frame of a ten-minute recording with loops, and the cost of checkpoints during playback."""
 
 import math
 import time
@@ -29,16 +29,16 @@ MIB = 1 << 20
 
 
 def run(recording: Path | None = None) -> list[Line]:
-    """Args: recording: another one than the simulated ten minutes."""
+    """Args: recording: to use instead of the simulated ten minutes."""
     path = recording or long_recording()
     return [*seeking(path), *cost(path, SMALL_BUDGET)]
 
 
 def seeking(path: Path, settled: Callable[[EngineProcess], None] = lambda engine: None) -> list[Line]:
-    """From the command to the snapshot that shows the frame, through the engine's process.
+    """Time from the command to the snapshot that shows the frame, through the engine's process.
 
     Args:
-        settled: called when all has been played, before times are taken.
+        settled: called after everything has been played, before times are measured.
     """
     engine = EngineProcess(Setup(recording=path, params=resolve_params(path, None, None, []), speed=math.inf))
     rng = np.random.default_rng(0)
@@ -73,12 +73,12 @@ def _until(engine: EngineProcess, holds: Callable[[Snapshot], bool]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not holds(snapshot := engine.snapshot):
         if not snapshot.engine_alive or time.monotonic() > deadline:
-            raise RuntimeError(f"it did not come about: {snapshot.transport} {snapshot.notices[-1:]}")
+            raise RuntimeError(f"the wanted state was not reached: {snapshot.transport} {snapshot.notices[-1:]}")
         engine.wait(snapshot.revision, 1.0)
 
 
 class _Timed(Checkpoints):
-    """Counts the seconds that taking and keeping checkpoints takes."""
+    """Measures the seconds spent on making and storing checkpoints."""
 
     seconds = _begin = 0.0
 
@@ -92,7 +92,7 @@ class _Timed(Checkpoints):
 
 
 def cost(path: Path, budget: int, frames: int | None = None) -> list[Line]:
-    """The share of the time that goes into checkpoints, and what they take with a budget of memory (bytes).
+    """The share of time spent on checkpoints, and the space that they need with a memory budget (bytes).
 
     Args:
         frames: to play; None: all.

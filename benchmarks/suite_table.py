@@ -1,4 +1,4 @@
-"""Writes the results of `hemislam evaluate --suite paper` beside the figures of the paper into the documentation.
+"""Writes the results of `hemislam evaluate --suite paper` into the documentation, beside the paper's figures.
 
 hemislam evaluate --suite paper --short --seed 0 --seed 1 --seed 2 --out runs/suite
 python -m benchmarks.suite_table runs/suite
@@ -32,7 +32,7 @@ def with_section(page: str, text: str) -> str:
 
 
 def section(results: dict[str, Any]) -> str:
-    """Rows of each sequence, here and in the paper; then what may be compared, and what the table says."""
+    """Rows of each sequence, here and in the paper; then what may be compared, and the findings."""
     machine = results["machine"]
     lines = [
         f"| sequence | | {' | '.join(SYSTEMS)} |",
@@ -74,7 +74,7 @@ def section(results: dict[str, Any]) -> str:
 
 
 def _mean(trees: list[Any], *path: str) -> float | None:
-    """Over all seeds; None if one of them has no value."""
+    """The mean over all seeds; None if a seed has no value."""
     values = [_at(tree, *path) for tree in trees]
     there = [value for value in values if value is not None]
     return sum(there) / len(there) if there and len(there) == len(values) else None

@@ -1,8 +1,8 @@
-"""The time a frame takes over the length of a walk: it must stay as it is, however large the map has grown.
+"""Time per frame over a long walk: it must not grow with the map.
 
-Loops are searched within the frames that are keyframes, so that their work counts too: they show in the mean and
-not in the median. Frames far apart on the walk are hours apart for a machine that others use as well; so a second
-engine waits at the early ones, and both work in turn, frame by frame, when the first has come to the late ones.
+Loops are searched within the frames that are keyframes, so that this work counts too: it appears in the mean but not in
+the median. On a shared machine, early and late frames of the walk would be processed hours apart. Therefore a second
+engine waits at the early frames; when the first one reaches the late frames, both work in turn, frame by frame.
 """
 
 from itertools import islice
@@ -25,13 +25,13 @@ from benchmarks.record import Line
 from benchmarks.scenes import FOLDER
 
 TWIN = "outdoor_3"
-"""9,530 frames and 869 m, the longest of the paper's sequences."""
+"""The longest of the paper's sequences: 9,530 frames and 869 m."""
 EVERY_BLOCK = 6
-"""9,600 firings a scan: the map grows just as much, and the recording is made within minutes."""
+"""9,600 firings per scan: the map grows just as much, and the recording is made within minutes."""
 AROUND = 250
 EARLY, LATE = 1000, 9000
 PLACES = (3000, 5000, 7000)
-"""Frames on the way, whose times are those of whatever the machine did then."""
+"""Frames in between, whose times depend on the machine's load at that moment."""
 
 
 def run() -> list[Line]:
@@ -40,7 +40,7 @@ def run() -> list[Line]:
 
 
 def measure(path: Path) -> list[Line]:
-    """Whole-frame time in ms around some frames, and that at the late ones over that at the early ones."""
+    """Whole-frame time in ms around some frames, and the ratio of late to early times."""
     params = resolve_params(path, None, None, [])
     waiting, walking = _Walk(path, params), _Walk(path, params)
     early: list[Measurement] = []
@@ -71,7 +71,7 @@ def measure(path: Path) -> list[Line]:
 
 
 class _Walk(Feed):
-    """A session that is handed its measurements one by one."""
+    """A session that gets its measurements one by one."""
 
     def __init__(self, path: Path, params: Params) -> None:
         self._path = path

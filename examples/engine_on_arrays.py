@@ -1,4 +1,4 @@
-"""The engine on plain arrays: a sensor moves 2 m through a room of 10 x 8 x 3 m. Everything is computed here.
+"""The engine on plain arrays: a sensor moves 2 m through a room of 10 x 8 x 3 m. All input is computed here.
 
 python examples/engine_on_arrays.py
 """
@@ -14,14 +14,14 @@ REST_S, MOVE_S, LENGTH_M = 1.5, 4.0, 2.0
 
 
 def position(t: np.ndarray) -> np.ndarray:
-    """(n, 3) m at times (n,) s: at rest, then along x with a smooth start and end."""
+    """Positions (n, 3) m at times (n,) s: at rest, then along x with a smooth start and end."""
     u = np.clip((t - REST_S) / MOVE_S, 0, 1)
     x = LENGTH_M * (u - np.sin(2 * np.pi * u) / (2 * np.pi))
     return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
 
 
 def scan(start_s: float) -> Scan:
-    """One revolution of 0.1 s with 32 lines; each ray starts where the sensor is at its own time."""
+    """One revolution of 0.1 s with 32 lines; each ray starts at the sensor's position at the ray's own time."""
     azimuth, line = (
         grid.ravel() for grid in np.meshgrid(np.linspace(0, 2 * np.pi, 360, endpoint=False), np.arange(32))
     )
@@ -35,7 +35,7 @@ def scan(start_s: float) -> Scan:
 
 
 def imu(first_s: float, last_s: float) -> ImuSamples:
-    """Samples at 200 Hz that cover the interval: no rotation, the acceleration of the motion, and gravity."""
+    """Samples at 200 Hz that cover the interval: zero angular rate, and the acceleration of the motion plus gravity."""
     times = np.arange(round(200 * first_s) - 1, round(200 * last_s) + 2) / 200
     u = np.clip((times - REST_S) / MOVE_S, 0, 1)
     accel = np.tile([0.0, 0.0, 9.81], (len(times), 1))

@@ -32,7 +32,7 @@ if accepted:
     session.edit_loops((Reject(first.older, first.newer),))
     edited = session.loops.results()
     after = edited.frame.trajectory(session.log.odometry).positions
-    # 0 mm is usual: loops that odometry meets already move nothing (docs/decisions/019)
+    # 0 mm is usual: loops that already agree with the odometry move nothing (docs/decisions/019)
     moved = np.linalg.norm(after - before, axis=1).max()
     left = [edge for edge in edited.edges if edge.verdict is Verdict.ACCEPTED]
     still = any((edge.older, edge.newer) == (first.older, first.newer) for edge in left)

@@ -1,9 +1,9 @@
-"""A feed of your own: a text format that hemislam does not know becomes a session with a map.
+"""Your own feed: a text format that hemislam does not know becomes a session with a map.
 
     python examples/own_feed.py FOLDER
 
 FOLDER/lidar.csv holds `stamp_ns,x,y,z,intensity,ring` per point, FOLDER/imu.csv holds
-`stamp_ns,gx,gy,gz,ax,ay,az` per sample (rad/s and m/s^2, axes of the LiDAR). Ten scans are made per second.
+`stamp_ns,gx,gy,gz,ax,ay,az` per sample (rad/s and m/s^2, axes of the LiDAR). The feed makes ten scans per second.
 """
 
 import sys
@@ -21,7 +21,7 @@ PERIOD_NS = 100_000_000
 
 
 class CsvFeed(Feed):
-    """Cuts points into scans and pairs each with the IMU samples that cover it. Only `info` and `next` are needed."""
+    """Splits points into scans and pairs each with the IMU samples that cover it. Only `info` and `next` are needed."""
 
     def __init__(self, folder: Path) -> None:
         self._points = np.loadtxt(folder / "lidar.csv", delimiter=",")

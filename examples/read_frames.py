@@ -1,4 +1,4 @@
-"""A recording, frame by frame: what the doctor found, then each scan with its IMU samples.
+"""A recording, frame by frame: first the doctor's findings, then each scan with its IMU samples.
 
 python examples/read_frames.py sample_data/cloister.mcap
 """

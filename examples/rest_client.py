@@ -1,4 +1,4 @@
-"""The workbench, controlled over REST: play to a frame, change a parameter, save the trajectory.
+"""Control the workbench over REST: play to a frame, change a parameter, save the trajectory.
 
 hemislam serve sample_data/cloister.mcap --paused --no-browser
 python examples/rest_client.py http://127.0.0.1:8080
@@ -15,7 +15,7 @@ headers = {"Authorization": f"Bearer {token[0]}"} if token else {}
 with httpx.Client(base_url=url, headers=headers, timeout=60) as client:
 
     def wait_for_frame(frame: int) -> None:
-        """Return once the session is at this frame."""
+        """Wait until the session has reached this frame."""
         deadline = time.monotonic() + 120
         while client.get("/api/state").raise_for_status().json()["transport"]["frame"] != frame:
             if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""An evaluation of two variants on one recording, with a report in FOLDER.
+"""Evaluate two variants on one recording, and write a report to FOLDER.
 
 python examples/two_variants.py sample_data/cloister.mcap FOLDER
 """
@@ -13,7 +13,7 @@ from app.evaluation.truth import read_truth
 from app.evaluation.variants import Variant
 from app.slam.params import Params
 
-if __name__ == "__main__":  # the runs have processes of their own, which import this file
+if __name__ == "__main__":  # each run has its own process, which imports this file
     recording, folder = Path(sys.argv[1]), Path(sys.argv[2])
     params = Params().merged_yaml(recording.with_suffix(".params.yaml").read_text())
     truth = read_truth(str(recording.with_name(f"{recording.stem}_truth.tum")))

@@ -1,5 +1,5 @@
 """Damaged input of every kind: `python -m benchmarks.fuzz --seconds 60`.
 
-Each case follows from its kind and its seed. Those that once broke an invariant are kept in `seeds.txt`; the tests try
-them again each time.
+Each case is determined by its kind and its seed. Cases that once broke an invariant are kept in `seeds.txt`, and the
+tests repeat them every time.
 """

@@ -20,11 +20,11 @@ from benchmarks.fuzz.recordings import Recordings
 from benchmarks.fuzz.rest import REQUESTS_AT_ONCE, Rest
 
 SEEDS = Path(__file__).with_name("seeds.txt")
-"""`KIND:SEED` of cases that once broke an invariant, one a line."""
+"""`KIND:SEED` of the cases that once broke an invariant, one per line."""
 MOST_NEW = 5
-"""Cases that one run adds to them."""
+"""Most cases that one run adds to this file."""
 WORTH = {"recordings": 1, "packets": 2, "rest": 2, "session": 5, "text": 5, "page": 20}
-"""How many cases of each kind are tried in turn, so that each kind takes about as long."""
+"""How many cases of each kind are tried in turn, so that all kinds take about equally long."""
 EACH = {"packets": f" of {inputs.PACKETS_AT_ONCE} packets", "rest": f" of {REQUESTS_AT_ONCE} requests"}
 
 
@@ -51,7 +51,7 @@ class Fuzzer:
         self._recordings.close()
 
     def broken(self, case: str) -> str:
-        """Which invariant this case breaks, and how; "" if none. `case`: KIND:SEED."""
+        """The invariant that this case breaks, and how; "" if none. `case`: KIND:SEED."""
         kind, _, seed = case.partition(":")
         try:
             return self._kinds[kind](int(seed))

@@ -1,4 +1,4 @@
-"""Ways in which messages, files and bytes go wrong. Each takes a random generator, and changes what it is given."""
+"""Ways to damage messages, files and bytes. Each function takes a random generator and changes its input."""
 
 import copy
 import random
@@ -24,7 +24,7 @@ def clouds(entries: list[Entry]) -> list[Any]:
 
 
 def _part(luck: random.Random, things: list[Any]) -> list[Any]:
-    """One of them, some, a stretch, or all."""
+    """Choose one element, some, a stretch, or all."""
     share = luck.choice([0.0, 0.0, 0.01, 0.1, 0.5, 1.0])
     if luck.random() < 0.5:
         return luck.sample(things, max(1, round(share * len(things))))
@@ -142,16 +142,16 @@ MESSAGES: tuple[Callable[[random.Random, list[Entry]], None], ...] = (
     imu_spikes, imu_spikes, imu_scaled, imu_axes, imu_stuck, stamps, messages_lost, messages_shuffled,
     cloud_values, cloud_values, cloud_shape, cloud_data, cloud_fields,
 )  # fmt: skip
-"""What happens to messages; some of it more often."""
+"""Damage to messages; some kinds appear more often."""
 
 
 def bytes_damaged(luck: random.Random, data: bytes) -> bytes:
-    """Bits turned, a stretch overwritten, taken out, repeated, cut off or zero."""
+    """Flip bits, or overwrite, remove, repeat, cut off or zero a stretch."""
     made = bytearray(data)
     for _ in range(luck.choice([1, 1, 1, 5, 50])):
         if not made:
             break
-        # Mostly near the ends, where formats keep what they are read by.
+        # Mostly near the ends, where formats keep their headers and indexes.
         at = min(luck.choice([luck.randrange(len(made)), int(luck.expovariate(1 / 200))]), len(made) - 1)
         at = luck.choice([at, len(made) - 1 - at])
         length = luck.choice([1, 4, 8, 100, 5000])

@@ -1,4 +1,4 @@
-"""Damaged packets, session files, YAML and messages of a page: each is refused in a sentence, or taken."""
+"""Damaged packets, session files, YAML and messages of a page: each is refused with a sentence, or accepted."""
 
 import json
 import random
@@ -32,7 +32,7 @@ def _refused_well(error: HemislamError) -> str:
 
 
 def packets(seed: int, good: list[Packet]) -> str:
-    """A capture of a thousand packets, a third of them damaged, reordered or repeated; reading gives finite points."""
+    """A capture of a thousand packets, a third of them damaged, reordered or repeated; reading yields finite points."""
     luck = random.Random(seed)
     first = luck.randrange(max(len(good) - PACKETS_AT_ONCE, 1))
     chosen = good[first : first + PACKETS_AT_ONCE]
@@ -82,7 +82,7 @@ def session(seed: int, recording: Path) -> str:
 
 
 def text(seed: int) -> str:
-    """Parameters, edits of loops and addresses as a user types them, and damaged."""
+    """Parameters, loop edits and addresses as typed by a user, then damaged."""
     luck = random.Random(seed)
     kind = luck.randrange(3)
     good = (Params().to_yaml(), "- accept: [0, 5]\n- reject: [3, 9]\n", "rsbpearl://192.168.1.102:6699,7788")[kind]
@@ -104,7 +104,7 @@ def text(seed: int) -> str:
 
 
 def page(seed: int) -> str:
-    """A message of a page, damaged: the gate refuses it, or viser can read it."""
+    """A damaged message of a page: the gate refuses it, or viser can read it."""
     luck = random.Random(seed)
     values: dict[str, Any] = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 0.0), "fov": 1.0, "near": 0.1}
     values |= {"far": 100.0, "image_height": 100, "image_width": 100, "look_at": (1.0, 0.0, 0.0)}
@@ -133,7 +133,7 @@ def page(seed: int) -> str:
 
 
 def _changed(luck: random.Random, value: Any) -> Any:
-    """The same tree with one part replaced, taken out or added."""
+    """The same tree with one part replaced, removed or added."""
     odd: Any = luck.choice([None, "", "x" * 3000, True, [], {}, [[]], -1, 2**63 - 1, *HUGE, {"a": 1}, "\x1b[2J", "1.5"])
     if luck.random() < 0.2 or not isinstance(value, dict | list | tuple) or not value:
         return odd

@@ -1,4 +1,4 @@
-"""Damaged recordings of every format, run as a user runs them."""
+"""Damaged recordings of every format, processed like a user does."""
 
 import gc
 import io
@@ -48,13 +48,13 @@ from benchmarks.fuzz.damage import MESSAGES, Entry, bytes_damaged
 
 FORMATS = ("mcap-livox", "mcap", "mcap-lz4", "mcap-plain", "bag", "bag-bz2", "bag-lz4", "db3", "pcap")
 ONLY_BYTES = ("mcap-livox", "pcap")
-"""Of these the messages are not damaged one by one."""
+"""Formats whose messages are not damaged individually."""
 MOST_S, MOST_BYTES = 60, 2 << 30
-"""What one run may take."""
+"""Limits of one run."""
 TOLERANCE = 0.01
-"""Of the way: a trajectory that is off by more must be said to be in doubt."""
+"""Share of the path length: if a trajectory is off by more, the program must say that it is in doubt."""
 PORTS = (6699, 7788, 7799)
-"""Of the LiDAR, its settings and the IMU."""
+"""Ports of the LiDAR, of its settings and of the IMU."""
 Packet = tuple[int, int, bytes]
 """Time in ns, UDP port, payload."""
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -77,12 +77,12 @@ class Recordings:
     """Makes cases of a simulated walk and judges how they end. Close it at the end.
 
     Attributes:
-        good: the undamaged walk. said: what a run of it says. packets: what an RS-Bpearl, a Mid-360 and an
-            Airy would have sent.
+        good: the undamaged walk. said: output of a run on it. packets: those that an RS-Bpearl, a Mid-360 and an Airy
+            would have sent.
     """
 
     def __init__(self) -> None:
-        compile_kernels()  # as the imports above: what is here before the forks, none of them loads again
+        compile_kernels()  # like the imports above: forks need not load again what exists before them
         self._folder = tempfile.TemporaryDirectory()
         self._path = Path(self._folder.name)
         self.good = self._path / "good.mcap"
@@ -97,7 +97,7 @@ class Recordings:
             self._sent(self._path / "airy.mcap", AIRY),
         ]
         self._files: dict[str, bytes] = {}
-        gc.freeze()  # else each fork looks for garbage in all that is here, and so copies it
+        gc.freeze()  # otherwise garbage collection in each fork would copy all of this memory
         code, said, _, _ = self._run(self.good)
         assert code == 0, said
         self.said = {*SAYS_SO.findall(said)}
@@ -112,7 +112,7 @@ class Recordings:
             return [(sent.time_ns, PORTS[sent.stream], sent.data) for sent in sending]
 
     def _mid360(self) -> list[Packet]:
-        """Of the same recording, as though a Mid-360 had measured one point after the other."""
+        """Packets of the same recording, as if a Mid-360 had measured one point after another."""
         writer, sent = LivoxWriter(), []
         with open_recording(self.good, Params()) as recording:
             for entry in recording.entries():
@@ -125,7 +125,7 @@ class Recordings:
         return sorted(sent)
 
     def broken(self, seed: int) -> str:
-        """Which invariant the case breaks, and how; "" if none."""
+        """The invariant that the case breaks, and how; "" if none."""
         luck = random.Random(seed)
         path, what = self._damaged(luck)
         code, said, seconds, peak = self._run(path)
@@ -141,7 +141,7 @@ class Recordings:
         return self._wrong(said, what) if code == 0 else ""
 
     def _wrong(self, said: str, what: str) -> str:
-        """Whether a run that ended well is wrong without saying so."""
+        """Whether a successful run is wrong without saying so."""
         try:
             ours = read_tum(self._path / "out" / "trajectory.tum")
             error = compare(ours, self._truth)["ate_m"]["max"]
@@ -173,7 +173,7 @@ class Recordings:
         return self._with_params(path), f"{names} of {kind}"
 
     def _file(self, kind: str) -> bytes:
-        """The undamaged walk in a format, written when it is first wanted: all of them take seconds."""
+        """The undamaged walk in a format, written on first use, since each takes seconds."""
         if kind not in self._files:
             self._files[kind] = self._written(kind, self._entries).read_bytes()
         return self._files[kind]
@@ -197,7 +197,7 @@ class Recordings:
         return path
 
     def _run(self, path: Path) -> tuple[int, str, float, int]:
-        """Exit code, all that was printed, seconds and bytes of memory at most, of `hemislam run`."""
+        """Exit code, output, duration (s) and peak memory (bytes) of `hemislam run`."""
         begin = time.monotonic()
         with tempfile.TemporaryFile() as said:
             child = os.fork()
@@ -211,7 +211,7 @@ class Recordings:
 
 
 def _become_hemislam(arguments: list[str], said: int) -> None:
-    """In a child process: run the command line and end."""
+    """Run the command line in a child process and end it."""
     for stream in (1, 2):
         os.dup2(said, stream)
     sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(stream, "wb", 0), write_through=True) for stream in (1, 2))
@@ -233,7 +233,7 @@ def _become_hemislam(arguments: list[str], said: int) -> None:
 
 
 def _copied(message: Any) -> Any:
-    """A message whose parts can be changed; its points are shared."""
+    """A copy of a message whose parts can be changed; its points are shared."""
     import copy
 
     return (
@@ -263,7 +263,7 @@ def _write_mcap(path: Path, compression: str, entries: list[Entry], luck: random
 
 
 def _as_custom_msg(message: Any) -> bytes:
-    """The same cloud as Livox's driver sends it."""
+    """The same cloud in the message type of Livox's driver."""
     cloud = read_point_cloud_2(message)
     times = cloud.column("timestamp")
     begin_ns = round(float(times.min()) * 1e9)
@@ -318,7 +318,7 @@ def _write_db3(path: Path, entries: list[Entry]) -> None:
 
 
 def pcap(packets: list[Packet]) -> bytes:
-    """A capture with nanoseconds of UDP datagrams: time, port, payload."""
+    """Write a capture of UDP datagrams (time, port, payload) with nanosecond stamps."""
     made = [struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, 1)]
     for time_ns, port, data in packets:
         frame = bytes(12) + b"\x08\x00" + struct.pack(">BBHHHBBHII", 0x45, 0, 28 + len(data), 1, 0, 64, 17, 0, 1, 2)

@@ -1,4 +1,4 @@
-"""Valid and invalid requests made from the API's own OpenAPI document."""
+"""Valid and invalid requests, generated from the API's OpenAPI document."""
 
 import json
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ ANYTHING = ODD | st.recursive(
 
 @dataclass(frozen=True)
 class Sent:
-    """A request. valid: it conforms to the document."""
+    """A request. valid: whether it conforms to the document."""
 
     method: str
     path: str
@@ -46,14 +46,14 @@ class Document:
     """Generates requests.
 
     Args:
-        hints: schemas of bodies that the document leaves open, by (method, path).
+        hints: schemas of bodies that the document does not specify, by (method, path).
     """
 
     def __init__(self, document: Json, hints: dict[tuple[str, str], Json]) -> None:
         self._document, self._hints = document, hints
 
     def requests(self, skip: frozenset[str] = frozenset()) -> SearchStrategy[Sent]:
-        """Any request that the document describes, except on the paths to skip."""
+        """Any request in the document, except on skipped paths."""
         found = []
         for path, methods in self._document["paths"].items():
             if path not in skip:
@@ -122,7 +122,7 @@ class Document:
 
 
 def encoded(value: Json) -> bytes:
-    """As JSON, but with NaN and lone surrogates as Python writes them."""
+    """JSON, but with NaN and lone surrogates as written by Python."""
     return json.dumps(value).encode("ascii")
 
 

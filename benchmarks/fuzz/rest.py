@@ -1,4 +1,4 @@
-"""Requests to a workbench that runs: each gets an answer, none a server error, and the workbench goes on."""
+"""Requests to a running workbench: each gets an answer, none is a server error, and the workbench keeps running."""
 
 import re
 import subprocess
@@ -16,14 +16,14 @@ ROOT = Path(__file__).resolve().parents[2]
 REQUESTS_AT_ONCE = 20
 JSON = {"Content-Type": "application/json"}
 SLOW = frozenset({"/api/export/{name}"})
-"""Asked for now and then elsewhere: they write the whole map."""
+"""Paths requested only now and then, elsewhere, because they write the whole map."""
 
 
 class Rest:
-    """A workbench, started with the first case. Close it at the end.
+    """A workbench that starts with the first case. Close it at the end.
 
     Args:
-        recording: which it opens.
+        recording: to open.
     """
 
     def __init__(self, recording: Path) -> None:
@@ -41,7 +41,7 @@ class Rest:
         self._said.close()
 
     def broken(self, number: int) -> str:
-        """Which of twenty requests breaks an invariant, and how; "" if none."""
+        """The request among twenty that breaks an invariant, and how; "" if none."""
         if self._server is None:
             self._start()
         failures: list[str] = []
@@ -82,7 +82,7 @@ class Rest:
         self._document = Document(self._client.get("/api/openapi.json").json(), hints)
 
     def _news(self) -> str:
-        """What the workbench said since the last time."""
+        """Output of the workbench since the last call."""
         self._said.seek(self._told)
         news = self._said.read()
         self._told += len(news)
