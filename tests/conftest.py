@@ -1,4 +1,4 @@
-"""What all tests share: the recordings beside the project, and what a bare machine may lack."""
+"""Shared by all tests: settings, the recordings beside the project, and libraries that a bare machine may lack."""
 
 import gc
 import os

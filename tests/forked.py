@@ -1,4 +1,4 @@
-"""What the processes that tests fork import: those of the engine, of jobs, of searches, and of a live sensor."""
+"""Imports for the processes that tests fork: of the engine, of jobs, of searches, and of a live sensor."""
 
 import app.evaluation.run_job
 import app.evaluation.runner

@@ -1,4 +1,4 @@
-"""Short simulated walks that come back to where they began, for tests of what is done with loops."""
+"""Short simulated walks that return to their start, for tests of loops."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Child processes: messages, death, signals, orderly ends, and the fork server.
+"""Child processes: messages, death, signals, orderly shutdown, and the fork server.
 
 Tests app/fork_server.py.
 """

@@ -1,4 +1,4 @@
-"""The examples run as a user would run them, and come to the right results."""
+"""The examples run as a user would run them, and give the right results."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""A slice of the fuzzer: cases that once broke an invariant, and the first few of each kind."""
+"""A part of the fuzzer: cases that once broke an invariant, and the first few cases of each kind."""
 
 import subprocess
 import sys

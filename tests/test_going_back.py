@@ -1,4 +1,4 @@
-"""Going back in a session is known in few places: everything else follows logs and notices by itself."""
+"""Only a few places know that a session can go back: everything else follows logs and notices it there."""
 
 import ast
 import re

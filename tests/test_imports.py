@@ -1,4 +1,4 @@
-"""No module imports, over however many steps, a module that imports it; no two types of app share a name."""
+"""No import cycles, over any number of steps; no two types in app share a name."""
 
 import ast
 from collections import defaultdict

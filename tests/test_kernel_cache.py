@@ -1,4 +1,4 @@
-"""Where compiled kernels go when the usual folders cannot be written to."""
+"""The place of compiled kernels if the usual folders are not writable."""
 
 import os
 import tempfile

@@ -1,6 +1,6 @@
-"""One finds the tests of every module: by the name of a file, or by its first lines.
+"""The tests of every module can be found: by the name of a file, or by its docstring.
 
-The tests of app/ROOM/module.py are in a file test_module.py below tests/, or in one whose docstring says
+The tests of app/ROOM/module.py are in a file test_module.py below tests/, or in a file whose docstring says
 `Tests app/ROOM/module.py`.
 """
 

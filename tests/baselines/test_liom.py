@@ -1,4 +1,4 @@
-"""LIOM in a room whose every pose is known. Tests app/baselines/liom.py."""
+"""LIOM in a room where every pose is known. Tests app/baselines/liom.py."""
 
 from dataclasses import replace
 from functools import cache

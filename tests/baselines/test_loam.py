@@ -1,4 +1,4 @@
-"""LOAM, its features and its matching, in rooms whose every pose is known.
+"""LOAM, its features and its matching, in rooms where every pose is known.
 
 Tests app/baselines/loam.py, app/baselines/features.py, app/baselines/matching.py, app/baselines/poses.py.
 """

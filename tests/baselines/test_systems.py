@@ -1,7 +1,7 @@
-"""Baselines as `evaluate` runs them, and what it says of those that are not there.
+"""Baselines as run by `evaluate`, and its messages on baselines that are not installed.
 
 Tests app/baselines/systems.py, app/baselines/poses.py, and of app/baselines/peers.py the use of KISS-ICP and
-GenZ-ICP, by stand-ins for both. RKO-LIO is not run.
+GenZ-ICP, with stand-ins for both. RKO-LIO is not run.
 """
 
 import json

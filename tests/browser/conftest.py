@@ -1,4 +1,4 @@
-"""The workbench in a real Chromium, drawn in software. One browser for all tests: starting it takes longest."""
+"""The workbench in a real Chromium with software rendering. All tests share one browser, since starting it is slow."""
 
 import io
 import os

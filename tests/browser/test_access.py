@@ -1,4 +1,4 @@
-"""Everything can be reached by keyboard and read; and what drawing the map costs.
+"""Accessibility: everything can be reached by keyboard and is readable. Also the cost of drawing the map.
 
 Tests app/ui/appearance.py, in both themes.
 """

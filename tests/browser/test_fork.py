@@ -1,4 +1,4 @@
-"""A fork in a real Chromium: asked for, seen, swapped and kept."""
+"""A fork in a real Chromium: created, shown, swapped and kept."""
 
 import os
 from collections.abc import Iterator

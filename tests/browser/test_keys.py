@@ -1,4 +1,4 @@
-"""Keys of the page in a real Chromium: held ones, those pressed while a dialog is open, and what is typed.
+"""Keys of the page in a real Chromium: held keys, keys pressed while a dialog is open, and typing into fields.
 
 Tests app/ui/viser_adapter.py.
 """

@@ -1,4 +1,4 @@
-"""The page to share: opened from the disk, it shows the map within seconds and complains of nothing.
+"""The shareable page, opened from the disk: it shows the map within seconds, without errors.
 
 Tests app/export/share.py.
 """

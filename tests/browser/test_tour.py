@@ -1,4 +1,4 @@
-"""The tour of a first visit, and what the page's own script tells the server."""
+"""The tour on the first visit, and the messages of the page's own script to the server."""
 
 import json
 

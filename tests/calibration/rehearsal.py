@@ -1,4 +1,4 @@
-"""A calibration as it might have been found."""
+"""A made-up result of a calibration."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 """Tests app/calibration/excerpt.py, app/calibration/odometry.py, app/calibration/calibrate.py,
-app/calibration/words.py, app/cli/calibrate.py and app/evaluation/plots.py: where the LiDAR sits on the IMU,
+app/calibration/words.py, app/cli/calibrate.py and app/evaluation/plots.py: the pose of the LiDAR on the IMU,
 from a recording alone."""
 
 import json

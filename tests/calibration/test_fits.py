@@ -1,6 +1,6 @@
 """Tests app/calibration/inertial.py, app/calibration/rotation.py, app/calibration/translation.py and
-app/calibration/guide.py: the fits, on exact motions of a hand with the noise of both sensors; SciPy integrates nothing
-here, the motion is a spline whose derivatives are exact."""
+app/calibration/guide.py: the fits, on exact motions of a hand with the noise of both sensors. The motion is a spline
+with exact derivatives, so nothing is integrated numerically."""
 
 from dataclasses import replace
 

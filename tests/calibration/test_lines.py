@@ -1,4 +1,4 @@
-"""Tests app/calibration/lines.py: how points of all scan lines lie on planes tells what each line gets wrong."""
+"""Tests app/calibration/lines.py: the errors of each scan line follow from the distances of points to planes."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A mapped room against its exact shape. Tests app/cli/compare.py, app/ui/corners.py."""
+"""A mapped room compared with its exact shape. Tests app/cli/compare.py, app/ui/corners.py."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`hemislam export` from the outside: from results and from a session to the same points."""
+"""`hemislam export` from the outside: results and a session give the same points."""
 
 import json
 import shutil

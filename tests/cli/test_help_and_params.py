@@ -1,4 +1,4 @@
-"""Help that teaches, at once; parameters that are printed and read back; misspelt ones refused by name."""
+"""Help texts that are quick and informative; parameters printed and read back; misspelt parameters refused by name."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Tests app/cli/run.py: `run` and `info` where the mounting is not known."""
+"""Tests app/cli/run.py: `run` and `info` with an unknown mounting."""
 
 import json
 from pathlib import Path

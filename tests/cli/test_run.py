@@ -1,4 +1,4 @@
-"""`hemislam run` from the outside: right results, the same bytes again, and nothing lost when it goes wrong."""
+"""`hemislam run` from the outside: correct results, the same bytes every time, and nothing lost after a failure."""
 
 import json
 import signal

@@ -1,4 +1,4 @@
-"""The documentation builds without warnings, and what the program fills in is there."""
+"""The documentation builds without warnings, and contains the parts that the program fills in."""
 
 import os
 import re

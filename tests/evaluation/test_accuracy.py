@@ -1,4 +1,4 @@
-"""The errors of the tables against evo, on random and on real trajectories."""
+"""The errors in the tables compared with evo, on random and on real trajectories."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
 """Distances between maps. Tests app/evaluation/cloud_distance.py, app/slam/kernels/cells.py.
 
-The oracle is geometry: sampled surfaces that lie a known distance apart.
+The oracle is geometry: sampled surfaces at a known distance.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A real Dask scheduler and its workers run what one machine runs, to the same tables, though processes are killed.
+"""A real Dask scheduler and its workers give the same tables as one machine, even if processes are killed.
 
 Tests app/evaluation/cluster.py.
 """

@@ -1,4 +1,4 @@
-"""`hemislam evaluate` from the outside: the tables, resuming after a kill, and what it refuses.
+"""`hemislam evaluate` from the outside: its tables, resuming after a kill, and refused input.
 
 Tests app/evaluation/job.py, app/evaluation/runner.py, app/evaluation/variants.py.
 """

@@ -1,4 +1,4 @@
-"""The sentences of the report follow the figures, whichever way these go."""
+"""The sentences of the report agree with the figures, in whichever direction these change."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the page has compared in a process of its own. Tests app/evaluation/map_comparison.py."""
+"""The page's comparison of maps in a process of its own. Tests app/evaluation/map_comparison.py."""
 
 from dataclasses import replace
 from pathlib import Path

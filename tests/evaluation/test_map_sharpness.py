@@ -1,4 +1,4 @@
-"""Map sharpness on maps made of exact walls: what is known beforehand must be measured."""
+"""Map sharpness on maps of exact walls: the measured values must equal the known ones."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The report shows every figure that was measured, with its unit, in all of its forms.
+"""The report shows every measured figure with its unit, in all formats.
 
 Tests app/evaluation/crops.py, app/evaluation/figures.py, app/evaluation/measured.py,
 app/evaluation/tables.py.

@@ -1,4 +1,4 @@
-"""A part of a recording is measured as the same part of a whole run.
+"""A part of a recording gives the same measurements as that part of a whole run.
 
 Tests app/evaluation/run_job.py.
 """

@@ -1,4 +1,4 @@
-"""Suites of walks: twins of the paper's sequences, as long as these, and walks that revisit; the same every time.
+"""Suites of walks: twins of the paper's sequences with the same lengths, and walks with revisits; the same every time.
 
 Tests app/cli/options.py, app/evaluation/paper.py.
 """

@@ -1,4 +1,4 @@
-"""Truth of every format gives the same poses; truth that cannot be used is refused in one sentence.
+"""Truth in every format gives the same poses; unusable truth is refused with one sentence.
 
 Tests app/evaluation/truth_match.py.
 """

@@ -1,4 +1,4 @@
-"""Trajectories that the tests of evaluation make up, and the files that other tools would write of them."""
+"""Synthetic trajectories for the tests of evaluation, and the files that other tools would write for them."""
 
 from pathlib import Path
 

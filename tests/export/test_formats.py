@@ -1,6 +1,6 @@
 """E57, PCD and trajectories as other programs read them.
 
-Tests app/export/e57.py, app/export/paths.py, and of app/export/map_file.py what it writes as PCD.
+Tests app/export/e57.py, app/export/paths.py, and the PCD output of app/export/map_file.py.
 """
 
 import csv

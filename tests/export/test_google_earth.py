@@ -1,4 +1,4 @@
-"""A KMZ as Google Earth reads it: valid by the schema of KML 2.2, and at places that pyproj confirms."""
+"""A KMZ as Google Earth reads it: valid by the schema of KML 2.2, and at positions that pyproj confirms."""
 
 import importlib
 import importlib.resources

@@ -1,4 +1,4 @@
-"""Maps of other programs are read, or refused in a sentence. Tests app/export/read_points.py."""
+"""Maps of other programs are read, or refused with a sentence. Tests app/export/read_points.py."""
 
 import struct
 import warnings

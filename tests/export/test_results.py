@@ -1,4 +1,4 @@
-"""What a run writes: complete, readable by others, and never over older results by accident.
+"""The files of a run: complete, readable by other programs, and never written over older results by accident.
 
 Tests app/export/exports.py, app/export/folder.py, app/export/map_file.py, app/export/points.py, app/slam/ply.py,
 app/slam/run_log.py.

@@ -1,4 +1,4 @@
-"""Lay a walk on satellite fixes. Oracle: the curve that both were made of.
+"""Align a walk with satellite fixes. Oracle: the curve from which both were made.
 
 Tests app/georeference/align.py, app/georeference/ground.py, app/georeference/path.py.
 """

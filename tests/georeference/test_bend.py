@@ -1,4 +1,4 @@
-"""Bend a map that drifted by its fixes. Oracle: the walk as it truly was."""
+"""Bend a drifted map to fixes. Oracle: the true walk."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Control points. Oracle: SciPy's general least squares over a rotation vector and a shift."""
+"""Control points. Oracle: SciPy's general least squares over a rotation vector and a translation."""
 
 from pathlib import Path
 from typing import Any

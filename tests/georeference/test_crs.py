@@ -1,4 +1,4 @@
-"""Coordinate systems: which fits a place. Oracle: the areas of use that EPSG states."""
+"""The coordinate system for a place. Oracle: the areas of use stated by EPSG."""
 
 import pyproj
 import pytest

@@ -1,4 +1,4 @@
-"""What drift does to what fixes determine. Oracles: many random walks, solved by least squares; dense covariances."""
+"""The effect of drift on estimates from fixes. Oracles: least squares on many random walks; dense covariances."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What is told of each fix. Tests app/georeference/ledger.py and app/evaluation/plots.py."""
+"""The report on each fix. Tests app/georeference/ledger.py and app/evaluation/plots.py."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Sentences of a receiver. Oracle: the example that every description of NMEA quotes."""
+"""NMEA sentences of a receiver. Oracle: the example quoted in every description of NMEA."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Where on Earth a map lies. Oracle: pyproj's own geodesics, which know nothing of our grid arithmetic."""
+"""The position of a map on Earth. Oracle: pyproj's own geodesics, which do not use our grid arithmetic."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A walk with a satellite receiver whose truth is known to the last digit."""
+"""A walk with a satellite receiver and exactly known truth."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,7 @@
-"""One small walk whose trajectory is kept, so that a change of the engine that shifts results is seen and meant.
+"""A small walk with a stored trajectory, so that no change of the engine shifts results unnoticed.
 
-To keep a new one after a change that is meant: `python -m tests.golden.test_golden_walk`, and say why in the commit.
+After an intended change, store the new trajectory with `python -m tests.golden.test_golden_walk`, and say why in the
+commit.
 """
 
 from pathlib import Path

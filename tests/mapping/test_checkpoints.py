@@ -1,4 +1,4 @@
-"""States to go back to: where there are some, and how much room they take."""
+"""Checkpoints: at which frames they are kept, and how much space they take."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A recording, or a part of it; read ahead by a thread it gives what it gives without."""
+"""A recording, or a part of it: reading ahead in a thread gives the same entries as reading without one."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Labels change after the fact, and the keyframes below them never do."""
+"""Labels may change later; the keyframes themselves never change."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Loops are looked for in a process. One that dies is replaced by another, which is sent what it lacks."""
+"""Loops are searched in a process. If it dies, it is replaced by another one, which gets the missing data."""
 
 import os
 import signal

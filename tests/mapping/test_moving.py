@@ -1,6 +1,6 @@
-"""The layer of moving points follows from the keyframes, whatever way led to them. Tests app/mapping/moving.py.
+"""The layer of moving points depends only on the keyframes, not on how they came about. Tests app/mapping/moving.py.
 
-Three walls of points stand around the sensor. A disc stood a metre in front of one of them in one keyframe only.
+Three walls of points surround the sensor. In one keyframe only, a disc stands a metre in front of one of them.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A session whose recorder was paused."""
+"""A session on a recording whose recorder was paused."""
 
 from collections.abc import Iterator
 from dataclasses import replace

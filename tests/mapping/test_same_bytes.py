@@ -1,4 +1,4 @@
-"""The workbench, `replay` of its session and `run` write the same bytes, also of loops that only the end brings.
+"""The workbench, `replay` of its session and `run` write the same bytes, even with loops found only at the end.
 
 Tests app/mapping/opening.py, app/mapping/saving.py.
 """

@@ -1,4 +1,4 @@
-"""What a session file holds is what is read, cut off or not; what cannot be is refused or left out with a sentence.
+"""A session file reads back as written, even if truncated; impossible content is refused or left out with a sentence.
 
 Tests app/mapping/session_file.py, app/mapping/kept.py.
 """

@@ -1,4 +1,4 @@
-"""Each recording beside the project goes through the real reader and the engine once a session."""
+"""Each recording beside the project goes through the real reader and the engine once per test session."""
 
 from collections import Counter
 from collections.abc import Callable

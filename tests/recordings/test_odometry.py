@@ -1,4 +1,4 @@
-"""Recordings that this project's own simulator did not make, against their truth (../shared/data/README.md)."""
+"""Recordings not made by this project's simulator, compared with their truth (../shared/data/README.md)."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Four real frames of a static RS-Bpearl: registered onto each other, nothing may have moved."""
+"""Four real frames of a static RS-Bpearl: registration of one to another must give no motion."""
 
 from itertools import permutations
 from pathlib import Path

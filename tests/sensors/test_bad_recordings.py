@@ -1,4 +1,4 @@
-"""What cannot be used is refused in one sentence that says what, where and what to do."""
+"""Unusable recordings are refused with one sentence that says what is wrong, where, and what to do."""
 
 import sqlite3
 from contextlib import nullcontext

@@ -1,4 +1,4 @@
-"""Tests app/sensors/source.py: the advice for damaged files works as it is written."""
+"""Tests app/sensors/source.py: the advice for damaged files works as written."""
 
 import re
 import shlex

@@ -1,4 +1,4 @@
-"""Points that are too far, or equally far, are named for what they are."""
+"""Points that are too far away, or all equally far, are reported as such."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The doctor names what is wrong with a recording, and nothing else.
+"""The doctor reports the faults of a recording, and nothing else.
 
 Tests app/sensors/clocks.py.
 """

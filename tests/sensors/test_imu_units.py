@@ -1,4 +1,4 @@
-"""An IMU whose unit or axes are not what they should be is found by gravity, which turns as the gyroscope says."""
+"""Wrong units or axes of an IMU are detected by gravity, which must rotate as the gyroscope measures."""
 
 import numpy as np
 import pytest

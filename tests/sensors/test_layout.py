@@ -1,4 +1,4 @@
-"""What a driver leaves open is decided rightly from the data, and the decision is explained."""
+"""Everything that a driver leaves undefined is inferred correctly from the data, and the decision is explained."""
 
 from dataclasses import replace
 

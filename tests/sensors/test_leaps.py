@@ -1,4 +1,4 @@
-"""A clock that is set in the middle of a recording: the times go on without a jump, and a finding names the leap."""
+"""A clock set in the middle of a recording: times continue without a jump, and a finding reports the leap."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""CustomMsg of the Livox drivers: what rosbags writes of any message, we read point by point, and what may be wrong.
+"""CustomMsg of the Livox drivers: messages written by rosbags are read point by point; possible faults are handled.
 
 Tests app/sensors/livox.py, app/sensors/clocks.py.
 """

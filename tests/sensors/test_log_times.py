@@ -1,4 +1,4 @@
-"""Log times that a turned bit or a recorder's clock has made wrong spoil no other message."""
+"""Log times made wrong by a flipped bit or a recorder's clock do not affect other messages."""
 
 from pathlib import Path
 

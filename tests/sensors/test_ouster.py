@@ -1,7 +1,7 @@
 """Tests app/sensors/ouster.py: packets of an Ouster, decoded as its own library decodes them.
 
-`ouster_sdk.json` holds what ouster-sdk 1.0.1 gives for the captures in ../shared/data/sensors/ouster: of each scan and
-return the number of points, their sum and every fortieth of them (index, x, y, z in the sensor's frame, time,
+`ouster_sdk.json` holds the output of ouster-sdk 1.0.1 for the captures in ../shared/data/sensors/ouster: for each scan
+and return, the number of points, their sum and every fortieth point (index, x, y, z in the sensor's frame, time,
 reflectivity, row), and all IMU samples (time, rad/s, m/s²).
 """
 

@@ -1,4 +1,4 @@
-"""Any PointCloud2 decodes to the scan that was measured.
+"""Every PointCloud2 is decoded to the measured scan.
 
 Tests app/sensors/azimuth.py, app/sensors/rings.py, app/sensors/timing.py.
 """

@@ -1,4 +1,4 @@
-"""The same walk reads the same from every container, from any start, and from the recordings of others.
+"""The same walk reads the same from every container, from any start, and from recordings of other projects.
 
 Tests app/slam/provenance.py.
 """

@@ -1,4 +1,4 @@
-"""A folder of ROS 2 whose metadata.yaml is wrong: someone renamed a file or changed how topics are to be played, or a
+"""A ROS 2 folder whose metadata.yaml does not match: a file was renamed, playback settings of topics were changed, or a
 newer ROS wrote it."""
 
 import re

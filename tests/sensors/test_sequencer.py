@@ -1,4 +1,4 @@
-"""A scan is given with the IMU samples that cover it, as far as there are any; nothing good is lost."""
+"""Each scan gets the IMU samples that cover it, as far as they exist; no good data is lost."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Values that no IMU measures are left out, wherever they are, and nothing that a person does is.
+"""Values that no IMU can measure are dropped wherever they occur; values of human motion never are.
 
 Tests app/sensors/sequencer.py.
 """

@@ -1,4 +1,4 @@
-"""The simulated walk and what its IMU feels.
+"""The simulated walk and its IMU measurements.
 
 Tests app/sensors/simulator/trajectory.py.
 """

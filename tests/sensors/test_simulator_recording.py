@@ -1,4 +1,4 @@
-"""What the simulator writes: layout, stamps, truth, and agreement with recordings that it did not make.
+"""The simulator's files: layout, stamps, truth, and agreement with recordings from other sources.
 
 Tests app/sensors/simulator/simulate.py.
 """

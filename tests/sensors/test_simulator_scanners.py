@@ -1,4 +1,4 @@
-"""Recordings of the simulated scanners: recognised, read by their drivers' conventions, and walked as it was.
+"""Recordings of the simulated scanners: recognised, read by the conventions of their drivers, with the true trajectory.
 
 Tests app/sensors/simulator/scanners.py and the presets of these scanners.
 """

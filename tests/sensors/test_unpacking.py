@@ -1,4 +1,4 @@
-"""A chunk that unpacks to gigabytes is refused before it does, in every format; what recorders write is read."""
+"""A chunk that would decompress to gigabytes is refused in time, in every format; normal recordings are read."""
 
 import bz2
 import struct

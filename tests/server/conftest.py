@@ -1,4 +1,4 @@
-"""The engine's process is spawned anew and must find `server_fakes`, so its folder goes on the path."""
+"""The engine's process is newly spawned and must find `server_fakes`, so this folder is added to the path."""
 
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
-"""A recording that exists only in memory and an engine that knows the answer, for tests of what surrounds them.
+"""A recording in memory and an engine that knows the result, for tests of everything around them.
 
-The walk is a circle of 2 m radius at 10 frames a second, every frame turned by 2°. The "engine"
-reports that pose. Points with z < `ground.sigma` are called ground, so a relabelling can be checked.
+The walk is a circle of 2 m radius at 10 frames per second, with a rotation of 2° per frame. The "engine"
+reports that pose. Points with z < `ground.sigma` are labelled ground, so that relabelling can be checked.
 """
 
 import threading

@@ -1,4 +1,4 @@
-"""The server's public port on a real socket, for tests of what goes over it."""
+"""The server's public port on a real socket, for tests of its traffic."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""A session on a recording that exists only in memory, as the page sees it: through snapshots."""
+"""A session on a recording in memory, seen like the page sees it: through snapshots."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Who is let in and how much they may send, over real sockets: the view-only token, sizes, what is logged."""
+"""Access control over real sockets: the view-only token, limits of sizes, and log entries."""
 
 import json
 import logging

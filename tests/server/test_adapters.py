@@ -1,4 +1,4 @@
-"""Contracts with libraries: adapters alone use private names, and tests name what an upgrade has changed.
+"""Contracts with libraries: only adapters use private names, and the tests report changes by an upgrade.
 
 Tests app/server/viser_adapter.py.
 """

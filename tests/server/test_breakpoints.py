@@ -1,4 +1,4 @@
-"""Where playing pauses by itself: the conditions on their own, and in a session."""
+"""Breakpoints: the conditions on their own, and in a session."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""What a page may send to viser: nothing but its camera if it is view only, no upload that is too large."""
+"""Messages that a page may send to viser: only its camera if it is view-only, and no upload that is too large."""
 
 import os
 from collections.abc import Iterator

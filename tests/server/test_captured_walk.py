@@ -1,4 +1,4 @@
-"""The packets of a walk as a capture file: the same walk, but for the steps in which packets hold it."""
+"""The packets of a walk as a capture file: the same walk, up to the resolution of the packets."""
 
 from pathlib import Path
 

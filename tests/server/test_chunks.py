@@ -1,4 +1,4 @@
-"""Of a map that outgrows its budget of points, what is far is thinned, and what is thinned away is held nowhere.
+"""If a map exceeds its budget of points, distant parts are thinned, and the removed points are stored nowhere.
 
 Tests app/server/publisher.py.
 """

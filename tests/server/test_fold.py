@@ -1,4 +1,4 @@
-"""Folding deltas gives the same snapshot however seldom they are taken."""
+"""Applying deltas gives the same snapshot, however rarely they are taken."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The page sees the folders it was given and nothing else."""
+"""The page sees only the given folders."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Two settings side by side: B is what A would be with other parameters, goes where A goes, and costs A nothing.
+"""Two settings side by side: B equals A with other parameters, follows A, and does not slow A down.
 
 Tests app/server/protocol.py.
 """

@@ -1,4 +1,4 @@
-"""A fork of a walk with loops: the same where nothing is different, and a word on a loop in B alone moves B alone."""
+"""A fork of a walk with loops: identical if nothing differs, and a loop edit in B moves only B."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A session that is laid on Earth. Oracle: where the simulator put its scene. Tests app/server/georeferencing.py,
+"""A georeferenced session. Oracle: the simulator's position of the scene. Tests app/server/georeferencing.py,
 app/mapping/earth.py and app/georeference/survey.py.
 """
 

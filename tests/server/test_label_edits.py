@@ -1,4 +1,4 @@
-"""Labels that the user changes: on the page, in the session's state, and undone.
+"""Label edits by the user: on the page, in the session's state, and undone.
 
 Tests app/server/controller.py and app/server/publisher.py.
 """

@@ -1,4 +1,4 @@
-"""The receiver, the engine, or both die while a walk is mapped live: it goes on in the same map, and says so."""
+"""The receiver, the engine, or both die during live mapping: mapping continues in the same map, with a notice."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Engines that die one after the other on live data, at every moment: nothing is missed, and nothing counted twice.
+"""Engines die one after another on live data, at every moment: nothing is missed, and nothing is counted twice.
 
 Tests app/sensors/live/address.py, app/sensors/live/receiver.py.
 """

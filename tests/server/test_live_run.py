@@ -1,4 +1,4 @@
-"""The workbench's engine on live data: the same map as from the file, and one that survives the engine."""
+"""The workbench's engine on live data: the map is the same as from the file, and survives the death of the engine."""
 
 import contextlib
 import math

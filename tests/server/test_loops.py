@@ -1,4 +1,4 @@
-"""Loops of the recording that ships, through a session: found beside the frames, overridden, taken back, replayed."""
+"""Loops of the sample recording in a session: found while frames are processed, overridden, undone, replayed."""
 
 import math
 import operator

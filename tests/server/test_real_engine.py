@@ -1,4 +1,4 @@
-"""The real engine in its process on the recording that ships."""
+"""The real engine in its process on the sample recording."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Requests made from the API's own description, valid and not: each gets an answer, none of them a server error."""
+"""Valid and invalid requests from the API's own description: each gets an answer, and none is a server error."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Going back and on again is as if one had never been elsewhere: to the last bit, in the engine and in the page."""
+"""Going back and continuing gives the same result as never going back, to the last bit, in engine and page."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""kill -9 of the real server: what is reopened lost no more than the last second, and comes to the same end."""
+"""kill -9 of the real server: a reopened session has lost at most the last second, and reaches the same result."""
 
 import os
 import signal

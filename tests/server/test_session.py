@@ -1,4 +1,4 @@
-"""What commands do to a session, seen as the page sees it: through snapshots."""
+"""The effects of commands on a session, seen like the page sees them: through snapshots."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A session is a file: reopened it is where it was, repeated headless it gives the same, killed it loses a moment.
+"""Session files: reopening restores the session, a headless replay gives the same result, a kill loses only a moment.
 
 Tests app/server/controller.py, app/server/keeping.py, app/server/loop_commands.py, app/server/player.py.
 """

@@ -1,4 +1,4 @@
-"""What a session reads and writes: recordings, truth, results; and what happens if they cannot be used."""
+"""Files that a session reads and writes: recordings, truth, results; and the behaviour if they cannot be used."""
 
 import errno
 import io

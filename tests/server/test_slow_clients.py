@@ -1,4 +1,4 @@
-"""Clients that never finish: they are disconnected, others are served meanwhile, and nothing piles up."""
+"""Clients that never finish: they are disconnected, others are served meanwhile, and no data accumulates."""
 
 import contextlib
 import socket

@@ -1,4 +1,4 @@
-"""The state as REST sends it: every number is one that JSON can express."""
+"""The state as sent by REST: JSON can express every number."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The engine in a process of its own: over real pipes, killed for real.
+"""The engine in a process of its own: with real pipes and real kills.
 
 Tests app/server/engine_process.py, app/server/setup.py, app/slam/warmup.py.
 """

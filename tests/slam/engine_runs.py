@@ -1,4 +1,4 @@
-"""Runs of the whole engine on walks whose every pose is known exactly, and how two of them are compared."""
+"""Runs of the whole engine on walks with exactly known poses, and the comparison of two runs."""
 
 from collections.abc import Iterable
 from dataclasses import fields, is_dataclass

@@ -1,9 +1,8 @@
-"""Small worlds whose every ray, pose and IMU sample is known exactly. Nothing here uses the code under test.
+"""Small worlds with exactly known rays, poses and IMU samples. Nothing here uses the code under test.
 
-A `Walk` is a smooth path with its derivatives written out, a `Scene` a set of axis-aligned boxes and
-planes that rays are intersected with in closed form; `measurements` puts the two together as the
-32-ring hemispherical LiDAR and its IMU would have seen them, each ray fired at its own time from the
-sensor's pose at that time.
+A `Walk` is a smooth path with explicit derivatives; a `Scene` is a set of axis-aligned boxes and planes,
+which rays intersect in closed form. `measurements` combines the two into the measurements of a 32-ring
+hemispherical LiDAR and its IMU, where each ray is fired at its own time from the sensor's pose at that time.
 """
 
 from collections.abc import Iterator

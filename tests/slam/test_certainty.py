@@ -1,4 +1,4 @@
-"""What a keyframe's covariance counts beside the filter's own."""
+"""The terms of a keyframe's covariance besides the filter's own covariance."""
 
 from dataclasses import replace
 

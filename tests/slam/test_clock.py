@@ -1,4 +1,4 @@
-"""A late or early clock of the IMU, learnt while moving, on walks whose every sample is known."""
+"""A late or early IMU clock, estimated while moving, on walks with exactly known samples."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace

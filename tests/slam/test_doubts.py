@@ -1,4 +1,4 @@
-"""A run that cannot be right says so; one that can be says nothing."""
+"""A run that cannot be right reports doubts; a plausible run reports none."""
 
 from collections.abc import Sequence
 

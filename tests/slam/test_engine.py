@@ -1,4 +1,4 @@
-"""The engine as a whole, on walks whose every pose is known exactly."""
+"""The engine as a whole, on walks with exactly known poses."""
 
 import pickle
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The same again, on any number of cores and from any checkpoint; and as long as one likes."""
+"""The engine gives the same result every time, on any number of cores, from any checkpoint, for runs of any length."""
 
 import hashlib
 import os

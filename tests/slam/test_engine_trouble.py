@@ -1,4 +1,4 @@
-"""What the engine does with bad scans, gaps and people in the way.
+"""The engine with bad scans, gaps, and people who block the view.
 
 Tests app/slam/prediction.py and app/slam/fusion.py.
 """

@@ -1,4 +1,4 @@
-"""The floor around a scanner held upright: gathered while walking, not mistaken for walls, kept under people's feet."""
+"""The floor around an upright scanner: collected while walking, not confused with walls, kept under people's feet."""
 
 from dataclasses import replace
 

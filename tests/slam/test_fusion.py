@@ -1,4 +1,4 @@
-"""What comes of a prediction and a scan. How exact it is: test_iekf, test_coast and test_engine_trouble."""
+"""The outcomes of fusing a prediction with a scan. test_iekf, test_coast and test_engine_trouble test the accuracy."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Ground segmentation: the floor, whatever the sensor's mounting, and nothing else; eq. 1-3 against numpy."""
+"""Ground segmentation finds the floor and nothing else, whatever the sensor's mounting; eq. 1-3 compared with numpy."""
 
 from functools import cache
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""A gyroscope whose scales are off, learnt while moving, on walks whose every sample is known.
+"""Scale errors of a gyroscope, estimated while moving, on walks with exactly known samples.
 
 Tests app/slam/gyroscope.py.
 """

@@ -1,4 +1,4 @@
-"""The filter's update: where it ends up, and with what it does nothing. `test_registration` checks its algebra."""
+"""The filter's update: its result, and the input on which it does nothing. `test_registration` checks its algebra."""
 
 from dataclasses import fields, replace
 

@@ -1,4 +1,4 @@
-"""Propagation against an independent integrator, its covariance against statistics, deskew against the world.
+"""Propagation compared with an independent integrator, its covariance with statistics, deskewing with the true scene.
 
 Tests app/slam/kernels/motion.py.
 """

@@ -1,4 +1,4 @@
-"""Compiled single-element operations against their readable forms, SciPy and numpy.
+"""Compiled single-element operations compared with their readable forms, SciPy and numpy.
 
 Tests app/slam/kernels/manifold.py, app/slam/kernels/small.py.
 """

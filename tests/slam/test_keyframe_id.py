@@ -1,4 +1,4 @@
-"""Keyframes of several sessions have names that differ, and those of one session are in order."""
+"""Keyframes of several sessions have different names, and those of one session are in order."""
 
 import copy
 import pickle

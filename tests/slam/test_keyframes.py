@@ -1,4 +1,4 @@
-"""Keyframes: when one is due, and that the store gives back exactly what it was given."""
+"""Keyframes: when one is due, and that the store returns exactly the stored data."""
 
 import threading
 from dataclasses import fields

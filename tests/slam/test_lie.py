@@ -1,4 +1,4 @@
-"""SO(3) and SE(3): the axioms over all angles, near-identity ones above all, and SciPy as the oracle."""
+"""SO(3) and SE(3): the axioms for all angles, especially near the identity, with SciPy as the oracle."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Errors of scan lines, learnt while walking, on scanners whose errors are known."""
+"""Errors of scan lines, estimated while walking, on scanners with known errors."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace

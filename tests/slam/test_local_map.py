@@ -1,4 +1,4 @@
-"""What the local map stores, against a dictionary, and what bounds its memory.
+"""The content of the local map compared with a dictionary, and the limits of its memory.
 
 Tests app/slam/kernels/map.py, app/slam/sections.py.
 """

@@ -1,4 +1,4 @@
-"""A reader that follows a log by its cursor ends with the rows of the log."""
+"""A reader that follows a log with its cursor ends with exactly the rows of the log."""
 
 from hypothesis import given
 from hypothesis import strategies as st

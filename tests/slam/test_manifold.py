@@ -1,4 +1,4 @@
-"""The state and its errors: one is added to the other, and told apart from it.
+"""The state and its errors: adding an error to a state, and the difference of two states.
 
 Tests app/slam/kernels/manifold.py.
 """

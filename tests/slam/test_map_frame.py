@@ -1,4 +1,4 @@
-"""Corrections lay odometry into the map."""
+"""Corrections transform odometry into the map."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,4 +1,4 @@
-"""Trajectory errors against evo, and what must hold whatever the trajectories are.
+"""Trajectory errors compared with evo, and properties that hold for any trajectories.
 
 Tests app/slam/trajectory.py.
 """

@@ -1,6 +1,8 @@
-"""What moves is found by looking through where it was. Tests app/slam/moving.py and app/slam/kernels/free_space.py.
+"""Moving points are found because rays pass through their places.
 
-The scans are cast by open3d into a room with a person; who was hit is known from a cast without him.
+Tests app/slam/moving.py and app/slam/kernels/free_space.py.
+
+The scans are cast by open3d into a room with a person; a cast without the person shows which rays hit them.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Parts of an array are worked on by several threads, each part once.
+"""Several threads process parts of an array, each part once.
 
 Tests app/slam/parallel.py.
 """

@@ -1,4 +1,4 @@
-"""A pause of both sensors: where the walk goes on, and how well it goes on from there."""
+"""A pause of both sensors: where the walk continues, and how accurately."""
 
 from dataclasses import replace
 from functools import cache

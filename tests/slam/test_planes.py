@@ -1,4 +1,4 @@
-"""Planes of the local map, against brute force.
+"""Planes of the local map compared with brute force.
 
 Tests app/slam/kernels/map.py, app/slam/local_map.py.
 """

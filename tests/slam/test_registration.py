@@ -1,4 +1,4 @@
-"""The algebra of the filter's update, against textbook formulas and SciPy.
+"""The algebra of the filter's update compared with textbook formulas and SciPy.
 
 Tests app/slam/iekf.py, app/slam/kernels/registration.py.
 """

@@ -1,4 +1,4 @@
-"""At rest the velocity is zero: what that holds, what it teaches, and when it is not believed."""
+"""At rest, the velocity is zero: what this constrains, what is learnt from it, and when it is not trusted."""
 
 from dataclasses import replace
 

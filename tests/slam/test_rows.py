@@ -1,4 +1,4 @@
-"""Arrays that grow leave alone what was handed out."""
+"""Growing arrays do not change arrays that were handed out."""
 
 import numpy as np
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""The start: what a rest tells about biases and gravity, and what is said when there is none."""
+"""The start: biases and gravity from a rest, and the messages if there is no rest."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A frame's numbers point by point, against SciPy and the engine's own summaries; files that others can read."""
+"""Numbers of a frame point by point, compared with SciPy and the engine's own summaries; files for other programs."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Voxel-grid downsampling against a dictionary.
+"""Voxel-grid downsampling compared with a dictionary.
 
 Tests app/slam/kernels/clouds.py.
 """

@@ -1,4 +1,4 @@
-"""A surveyed room, scans of it, and what is believed before an update."""
+"""A known room, scans of it, and the prior of an update."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Ground tuned on five frames labelled by hand is as good on all others as a fine grid can make it.
+"""Ground parameters tuned on five hand-labelled frames are as good on all other frames as those from a fine grid.
 
 Tests app/tuning/tune.py and app/evaluation/run_job.py with marks of the brush.
 """

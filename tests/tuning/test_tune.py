@@ -1,4 +1,4 @@
-"""A search tries settings, keeps the best, goes on after a stop, and refuses what cannot vary.
+"""A search tries settings, keeps the best, continues after a stop, and refuses parameters that cannot vary.
 
 Tests app/tuning/space.py, app/tuning/objectives.py, app/tuning/trial.py, app/tuning/tune.py, app/tuning/report.py,
 app/tuning/process.py.

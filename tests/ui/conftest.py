@@ -1,4 +1,4 @@
-"""A viser server whose messages to the browsers are written down."""
+"""A viser server that records its messages to browsers."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator

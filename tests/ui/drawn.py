@@ -1,4 +1,4 @@
-"""A scene as the workbench draws it, for tests of what it shows and sends."""
+"""A scene as drawn by the workbench, for tests of what it shows and sends."""
 
 from dataclasses import replace
 

@@ -1,7 +1,7 @@
-"""An engine to draw without an engine: a hemispherical sensor carried along an analytic corridor.
+"""A fake engine for drawing tests: a hemispherical sensor carried along an analytic corridor.
 
-Answers commands at once and in the caller's thread, so that tests need not wait; only `Play` has a
-thread of its own. Labels come from the corridor's true floor by the paper's rules, so that sliders
+It answers commands at once in the caller's thread, so that tests need not wait; only `Play` has a
+thread of its own. Labels follow from the corridor's true floor by the paper's rules, so that sliders
 have visible, predictable effects.
 """
 

@@ -1,4 +1,4 @@
-"""A workspace of two engines without an engine: B drifts to the left from the fork on."""
+"""A fake workspace with two engines: B drifts to the left from the fork on."""
 
 from collections.abc import Callable
 from pathlib import Path

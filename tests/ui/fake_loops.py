@@ -1,7 +1,7 @@
-"""An engine with loops to draw, without an engine: two laps through the corridors of a small building.
+"""A fake engine with loops for drawing tests: two laps through the corridors of a small building.
 
-Its graph is none: the more loops count, the nearer keyframes lie to where they truly were. That is
-enough to tell whether the page shows what it is given and sends what it is told.
+It has no real graph: the more loops count, the nearer the keyframes are to their true poses. This is
+enough to check that the page shows its data and sends the user's commands.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Tests app/ui/brush.py: clicks and rectangles mark points of the frame, and marks are kept, shown and given out."""
+"""Tests app/ui/brush.py: clicks and rectangles mark points of the frame; marks are kept, shown and downloaded."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Tests app/ui/calibration.py: the calibration panel shows what a process of its own found, and applies it."""
+"""Tests app/ui/calibration.py: the calibration panel shows and applies the result of a separate process."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""Where cameras stand and how points are lit.
+"""The positions of cameras and the shading of points.
 
 Tests app/ui/camera.py, app/ui/scale.py, app/ui/shading.py.
 """

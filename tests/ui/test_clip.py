@@ -1,4 +1,4 @@
-"""The clip box: its handles, its sections, and what of the map is shown.
+"""The clip box: its handles, its sections, and the visible part of the map.
 
 Tests app/ui/clip.py, app/ui/clip_maths.py, app/ui/profile.py.
 """

@@ -1,4 +1,4 @@
-"""A and B on one page: what differs, in numbers, in plots and in space, and what is asked for.
+"""A and B on one page: the differences in numbers, plots and the scene, and the commands sent.
 
 Tests app/ui/compare_maths.py.
 """

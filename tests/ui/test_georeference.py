@@ -1,4 +1,4 @@
-"""What lays the map on Earth, chosen in the page. Tests app/ui/georeference.py, app/ui/georeference_maths.py."""
+"""Georeferencing in the page. Tests app/ui/georeference.py, app/ui/georeference_maths.py."""
 
 from dataclasses import replace
 from pathlib import Path

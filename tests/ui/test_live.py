@@ -1,4 +1,4 @@
-"""The panel of a live source, and the transport while there is one.
+"""The panel of a live source, and the transport during live mapping.
 
 Tests app/ui/html.py.
 """

@@ -1,4 +1,4 @@
-"""Notes: a remark becomes a command, what the session keeps is listed and pinned, and none of it is taken for html."""
+"""Notes: a new note becomes a command, the session's notes are listed and pinned, and their text is never HTML."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The parameter panel: what a person sets becomes a command, what the engine says is shown, and neither echoes."""
+"""The parameter panel: values set by the user become commands, the engine's values are shown, and neither echoes."""
 
 import os
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The last session and recordings of before are offered.
+"""The page offers the last session and recent recordings.
 
 Tests app/ui/files.py, app/server/folders.py.
 """

@@ -1,4 +1,4 @@
-"""What the scene sends: differences, and nothing twice."""
+"""Messages of the scene: only changes, and nothing twice."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What the scene shows and keeps when a walk goes back, another one comes, and keyframes are replaced.
+"""The scene after going back, opening another recording, and replacing keyframes.
 
 Tests app/ui/scene.py and app/ui/chunks.py.
 """

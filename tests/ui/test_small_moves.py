@@ -1,4 +1,4 @@
-"""Loops move most of a map by almost nothing: the page is sent such moves only when they add up.
+"""Loops move most of a map only slightly: the page gets such moves only when they add up.
 
 Tests app/ui/widgets.py.
 """

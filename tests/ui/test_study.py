@@ -1,4 +1,4 @@
-"""A frame under study: what is coloured how, which point a click means, what is said of it.
+"""A studied frame: its colours, the point that a click selects, and the values shown for it.
 
 Tests app/ui/study_maths.py.
 """

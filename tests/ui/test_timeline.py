@@ -1,4 +1,4 @@
-"""The timeline: spikes survive thinning, frames gone back over stay, and the panel sends little; breakpoints."""
+"""The timeline: spikes survive thinning, later frames stay after going back, the panel sends little; breakpoints."""
 
 import base64
 import html

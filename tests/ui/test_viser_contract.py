@@ -1,4 +1,4 @@
-"""What `app.ui.viser_adapter` assumes of viser's page. When an upgrade breaks it, a sentence says what fails.
+"""The assumptions of `app.ui.viser_adapter` on viser's page. If an upgrade breaks one, a sentence says what fails.
 
 Tests app/ui/viser_adapter.py.
 """

@@ -1,4 +1,4 @@
-"""Number boxes keep to their limits, whatever is typed into them.
+"""Number boxes enforce their limits, whatever is typed into them.
 
 Tests app/ui/widgets.py.
 """

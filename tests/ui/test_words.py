@@ -1,4 +1,4 @@
-"""What the panels say, and how they plot.
+"""The texts of the panels, and their plots.
 
 Tests app/ui/files.py, app/ui/readouts.py, app/ui/status.py, app/ui/hints.py.
 """

@@ -1,4 +1,4 @@
-"""The whole page, drawn at the pace of eyes.
+"""The whole page, drawn only as often as eyes can follow.
 
 Tests app/ui/appearance.py.
 """

@@ -1,4 +1,4 @@
-"""Capture files written with `struct` alone, in every shape that networks give them."""
+"""Capture files written with `struct` alone, with the link layers, tags and fragments that occur in networks."""
 
 import struct
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Ports nobody uses, and waiting for something with an end to it."""
+"""Unused ports, and waiting with a time limit."""
 
 import socket
 import time

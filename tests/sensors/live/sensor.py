@@ -1,4 +1,4 @@
-"""An RS-Bpearl built with `struct` and `math` alone from the vendor's facts, by none of the code under test."""
+"""An RS-Bpearl built only with `struct` and `math` from the vendor's specification, without the code under test."""
 
 import datetime
 import functools

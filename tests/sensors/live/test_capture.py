@@ -1,4 +1,4 @@
-"""A capture of the sensor's packets is a recording like any other."""
+"""A capture of the sensor's packets works like any other recording."""
 
 import functools
 import random

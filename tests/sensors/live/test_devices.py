@@ -1,4 +1,4 @@
-"""A Mid-360's and an Airy's own packets: what they mean by the makers' tables, and a walk that is sent in them.
+"""Packets of a Mid-360 and of an Airy: their meaning by the makers' tables, and a walk sent as such packets.
 
 Tests app/sensors/live/devices.py, app/sensors/live/livox_udp.py, app/sensors/live/cloud_reader.py.
 """

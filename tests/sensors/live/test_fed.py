@@ -1,4 +1,4 @@
-"""A recording played out over real sockets arrives as the file has it.
+"""A recording sent over real sockets arrives with the content of the file.
 
 Tests app/sensors/live/feed.py, app/sensors/live/urls.py.
 """

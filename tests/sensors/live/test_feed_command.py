@@ -1,4 +1,4 @@
-"""`hemislam feed` explains itself, and refuses what cannot be in one sentence.
+"""`hemislam feed` explains itself, and refuses impossible input with one sentence.
 
 Tests app/__main__.py, app/cli/feed.py, app/cli/replay.py, app/cli/serve.py.
 """

@@ -1,4 +1,4 @@
-"""Points back into the firings that measured them: what packets then say of them is where they were."""
+"""Points are converted back into firings; packets made from these firings give the same points."""
 
 from collections.abc import Callable
 from pathlib import Path

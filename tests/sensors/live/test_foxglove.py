@@ -1,4 +1,4 @@
-"""The client understands any bridge: both protocol names, ROS 1 and 2, connections that end, nonsense.
+"""The client copes with any bridge: both protocol names, ROS 1 and 2, lost connections, and nonsense.
 
 Tests app/sensors/live/foxglove_server.py, app/sensors/live/pcap.py, app/sensors/mcap_stream.py, app/sensors/probe.py,
 app/sensors/source.py.

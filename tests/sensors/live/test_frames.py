@@ -1,4 +1,4 @@
-"""Revolutions come whole out of what a network does to packets, and nothing that comes in stops the rest.
+"""Complete revolutions are assembled whatever a network does to packets, and no packet stops the rest.
 
 Tests app/sensors/live/decoder.py, app/sensors/live/status.py.
 """

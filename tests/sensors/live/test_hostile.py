@@ -1,4 +1,4 @@
-"""What no well-behaved sensor does: it costs a count or one sentence, and nothing else.
+"""Input that no well-behaved sensor sends: it is counted or reported in one sentence, and has no other effect.
 
 Tests app/sensors/ros.py.
 """

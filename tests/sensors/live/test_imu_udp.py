@@ -1,4 +1,4 @@
-"""IMU datagrams: in order whatever the network did, and the sender that the documentation gives works.
+"""IMU datagrams: in order whatever the network does; and the sender in the documentation works.
 
 Tests app/sensors/live/udp.py.
 """

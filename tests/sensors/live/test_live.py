@@ -1,4 +1,4 @@
-"""A live source survives what sensors, networks and a busy engine do, and says so.
+"""A live source survives faults of sensors, networks and a busy engine, and reports them.
 
 Tests app/sensors/live/clock.py, app/sensors/live/intake.py, app/sensors/live/source.py.
 """

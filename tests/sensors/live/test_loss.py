@@ -1,4 +1,4 @@
-"""What a bad network does to the map: a capture of a walk with packets lost, doubled and out of order."""
+"""The effect of a bad network on the map: a capture of a walk with lost, duplicated and reordered packets."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The sensor's packets mean what the vendor's tables say, in every mode the sensor has.
+"""The sensor's packets are decoded as in the vendor's tables, in every mode of the sensor.
 
 Tests app/sensors/live/difop.py, app/sensors/live/msop.py.
 """

@@ -1,4 +1,4 @@
-"""Receiving goes on in its own process whatever becomes of the engine that polls it."""
+"""Receiving continues in its own process, whatever happens to the engine that polls it."""
 
 import os
 import signal

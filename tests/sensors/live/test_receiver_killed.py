@@ -1,4 +1,4 @@
-"""A receiving process that is killed comes back: what it had learnt, counted and recorded is still there."""
+"""A killed receiving process is restarted, and keeps everything that it had learnt, counted and recorded."""
 
 import contextlib
 import math

@@ -1,4 +1,4 @@
-"""One walk of a lap and a half round the corridor, with odometry that drifts, and the back end that walked it."""
+"""A walk of one and a half laps round the corridor with drifting odometry, and the loop back end after this walk."""
 
 from collections.abc import Iterator
 from dataclasses import fields

@@ -1,4 +1,4 @@
-"""A session whose loops are looked for by a worker that the test holds back, lets answer, and kills."""
+"""A session whose loop search runs in a worker that the test can hold back, let answer, and kill."""
 
 from collections import deque
 

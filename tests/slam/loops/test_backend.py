@@ -1,4 +1,4 @@
-"""What a walk with drifting odometry comes to: loops found, its history, and what is shown of it.
+"""The back end on a walk with drifting odometry: the loops found, its history, and its results for display.
 
 Tests app/slam/loops/files.py, app/slam/loops/search.py.
 """

@@ -1,4 +1,4 @@
-"""Odometry as one factor, and the poses between two that are known."""
+"""A stretch of odometry as one factor, and the poses between two known poses."""
 
 import numpy as np
 from scipy.optimize import least_squares

@@ -1,4 +1,4 @@
-"""The user's commands over what was found: given, undone, waiting, replayed."""
+"""The user's edits of the found loops: applied, undone, waiting, replayed."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""How certain loops are, as loops.csv says it. The rest of its columns is tested in test_backend."""
+"""The uncertainty of loops in loops.csv. Its other columns are tested in test_backend."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""Places are laid on each other without a good guess, and places that fit twice are noticed.
+"""Places are registered without a good guess, and places that fit in two ways are detected.
 
 Tests app/slam/loops/plan.py.
 """

@@ -1,4 +1,4 @@
-"""The pose graph meets an independent solver, survives failures and takes factors on one pose.
+"""The pose graph agrees with an independent solver, survives failures, and accepts factors on one pose.
 
 Tests app/slam/loops/factors.py, app/slam/loops/solvers.py, app/slam/loops/detection.py.
 """

@@ -1,4 +1,4 @@
-"""What was found takes effect at a frame that depends on nothing but the session."""
+"""Found loops take effect at a frame that depends only on the session."""
 
 from collections.abc import Iterator
 

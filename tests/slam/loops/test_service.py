@@ -1,4 +1,4 @@
-"""The loop back end as a function of the keyframes it was given and of the question.
+"""The loop back end as a function of its keyframes and of the request.
 
 Tests app/slam/loops/keyframe_log.py, app/slam/loops/messages.py.
 """

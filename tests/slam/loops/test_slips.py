@@ -1,4 +1,4 @@
-"""A slip of odometry is seen where it is, and no submap reaches across it.
+"""A slip of the odometry is detected where it occurs, and no submap extends across it.
 
 Tests app/slam/loops/slips.py.
 """

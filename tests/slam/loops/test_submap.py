@@ -1,4 +1,4 @@
-"""A submap is its keyframes' clouds, each thinned, shifted to where odometry has it, and thinned together."""
+"""A submap consists of its keyframes' clouds: each is thinned and placed by odometry, then all are thinned together."""
 
 from collections.abc import Iterator
 from dataclasses import replace

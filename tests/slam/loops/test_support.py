@@ -1,4 +1,4 @@
-"""Which of many loops at the same place tie poses of their own, which repeat one, and which stand by."""
+"""Of many loops at one place: which tie poses of their own, which repeat another loop, which are only represented."""
 
 from dataclasses import replace
 from itertools import pairwise

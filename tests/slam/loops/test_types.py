@@ -1,4 +1,4 @@
-"""Loop candidates as values, and the one difference between two states of them.
+"""Loop candidates as values, and the difference between two states of them.
 
 Tests app/slam/arrays.py.
 """

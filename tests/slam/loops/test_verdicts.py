@@ -1,4 +1,4 @@
-"""How certain a registration is, beside odometry; tests app/slam/loops/verdicts.py."""
+"""The certainty of a registration compared with odometry; tests app/slam/loops/verdicts.py."""
 
 from dataclasses import replace
 

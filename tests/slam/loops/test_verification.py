@@ -1,4 +1,4 @@
-"""Submaps are registered to one another.
+"""Registration of submaps to one another.
 
 Tests app/slam/kernels/patches.py, app/slam/kernels/submaps.py.
 """

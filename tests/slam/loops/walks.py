@@ -1,4 +1,4 @@
-"""Walks through simulated scenes as keyframes, without an engine: scans cast from exact poses, odometry as wished."""
+"""Walks through simulated scenes as keyframes, without an engine: scans cast from exact poses, with any odometry."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

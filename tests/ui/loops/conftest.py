@@ -1,4 +1,4 @@
-"""A workbench on a walk with loops, drawn as often as a test wishes, and whoever clicks in it."""
+"""A workbench on a walk with loops, drawn whenever a test wants it, and simulated clicks."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""A loop added by hand: its keyframes are picked, its guess is nudged and tried."""
+"""Adding a loop by hand: picking its keyframes, moving and trying its guess."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,4 +1,4 @@
-"""The small drawings for one loop, and which edge an eye means.
+"""The small charts for one loop, and the choice of the edge under a click.
 
 Tests app/ui/loops/edges.py, app/ui/loops/panel.py.
 """

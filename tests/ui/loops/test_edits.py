@@ -1,4 +1,4 @@
-"""The user's word on a loop: proposed, seen as a ghost, applied, undone, saved and given again."""
+"""Loop edits: proposed, shown as a ghost, applied, undone, saved and loaded again."""
 
 from types import SimpleNamespace
 from typing import Any

@@ -1,4 +1,4 @@
-"""All there is on one loop: its submaps in the scene, its numbers, its frame."""
+"""Everything about one loop: its submaps in the scene, its numbers, its frame."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Loops in the scene: which arches are drawn, where, and which of them a click means."""
+"""Loops in the scene: which arches are drawn, where, and which one a click selects."""
 
 from dataclasses import replace
 

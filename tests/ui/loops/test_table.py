@@ -1,4 +1,4 @@
-"""The table of all candidates, and what a click in it does."""
+"""The table of all candidates, and the effect of clicks in it."""
 
 from dataclasses import replace
 
