@@ -1,4 +1,4 @@
-"""The work of the engine's process: commands come in, one piece of work is done at a time, changes go out."""
+"""The work of the engine's process: takes commands, does one piece of work at a time, and publishes changes."""
 
 import logging
 import math
@@ -35,9 +35,9 @@ log = logging.getLogger(__name__)
 
 _OF_THE_DEVICE = ("recording.", "sensor.")
 POLL_S = 0.02
-"""s between two looks for results of other threads and processes."""
+"""s between two checks for results of other threads and processes."""
 _AT_ONCE = protocol.OpenRecording | protocol.Restart | protocol.SetSpeed | protocol.SetBreakpoints
-"""Commands that do not wait for the session that is being opened."""
+"""Commands that do not wait while a session is being opened."""
 _FOR_THE_FRAME = (
     protocol.LoopCommand
     | KeptCommand
@@ -47,7 +47,7 @@ _FOR_THE_FRAME = (
     | protocol.CompareWith
     | protocol.Save
 )
-"""Commands that wait until a reopened session is at its frame."""
+"""Commands that wait until a reopened session has reached its frame."""
 
 
 OpenSession = Callable[[Path, Path | None, Params, tuple[float, float | None] | None], Session]
@@ -58,9 +58,9 @@ class Controller:
     """The open session and its transport. One thread calls `handle` and `work`.
 
     Args:
-        page: receives all changes. params: at the start.
-        resolve: gives the parameters of a recording, before the user's changes; None: the present ones.
-        session_folder: for session files; None: none are written. kept: of a live session that another process
+        page: receives all changes. params: initial parameters.
+        resolve: returns the parameters of a recording, before the user's changes; None: use the present ones.
+        session_folder: for session files; None: write none. kept: user data of a live session that another process
             began. clock: monotonic seconds.
     """
 
@@ -79,18 +79,18 @@ class Controller:
         self._loops, self._player, self._writer = LoopCommands(page), Player(page, clock), SessionWriter()
         self._georeferencing = Georeferencing(page)
         self._saves: deque[tuple[protocol.Save, Future[Any]]] = deque()
-        self._share = 0.0  # share of a save that is written
+        self._share = 0.0  # share of the running save
         self._shown_share: protocol.Progress | None = None
         self._open_session, self._resolve, self._session_folder = open_session, resolve, session_folder
         self._params = self._base = params  # with and without the user's changes
         self._kept = kept
         self._resuming: SavedSession | None = None  # the session that is being repeated
         self._opening: tuple[protocol.Progress, Callable[[], None]] | None = None  # opens the next session
-        self._waiting: list[Command] = []  # until that session is at its frame
-        self._of_before = 0  # number of these, from the first, that waited when another session was requested
+        self._waiting: list[Command] = []  # until that session has reached its frame
+        self._of_before = 0  # how many of these already waited when another session was requested
 
     def open(self, path: Path, truth: Path | None, *, play: bool = False) -> None:
-        """Open a recording with exactly the present parameters, or a session file with its own."""
+        """Open a recording with exactly the present parameters, or a session file with its own parameters."""
 
         def opening() -> None:
             self._open(path, truth, self._params)
@@ -100,7 +100,7 @@ class Controller:
 
     # --- commands --------------------------------------------------------------------------------
     def handle(self, command: Command) -> None:
-        """Carry out a command. If it cannot be done, there is a notice; nothing is raised."""
+        """Carry out a command. If that is impossible, publish a notice; nothing is raised."""
         opening = self._opening is not None and not isinstance(command, _AT_ONCE)
         if opening or (self._resuming is not None and isinstance(command, _FOR_THE_FRAME)):
             self._waiting.append(command)
@@ -163,7 +163,7 @@ class Controller:
                 self._loops.handle(command, loops)
 
     def relabel(self) -> None:
-        """Relabel the frame if ground parameters were changed, so that the page gets both at once and draws once."""
+        """Relabel the frame if ground parameters changed, so that the page gets both together and draws once."""
         if self._opening is None:
             self._player.relabel()
 
@@ -180,11 +180,11 @@ class Controller:
         self._page.put(breakpoints=breakpoints, urgent=True)
 
     def _set_share(self, share: float) -> None:
-        """Called by the thread that saves; `work` shows it."""
+        """Store the progress; called by the saving thread, and shown by `work`."""
         self._share = share
 
     def _show_share(self, share: float | None) -> None:
-        """Show the progress of a save, in steps of a hundredth; None: it has ended. Opening waits for the save."""
+        """Show the progress of a save, in steps of 1 %; None: it has ended. Opening waits for the save."""
         shown = self._opening[0] if self._opening is not None else None
         if share is not None:
             then = f", then {shown.title[0].lower()}{shown.title[1:]}" if shown is not None else ""
@@ -238,7 +238,7 @@ class Controller:
         if self._saves:
             self._show_share(self._share)
         if self._opening is not None and saving:
-            return POLL_S if self._saves else 0.0  # the page first says that it is being opened
+            return POLL_S if self._saves else 0.0  # first let the page show the opening
         if self._opening is not None:
             self._do_opening(self._opening[1])
             return 0.0
@@ -247,7 +247,7 @@ class Controller:
             return wait
         if (saved := self._resuming) is not None:
             arrived = session.frame >= saved.frame and not saved.ended
-            if arrived or session.ended or session.heading < saved.frame:  # repeated, or the user went elsewhere
+            if arrived or session.ended or session.heading < saved.frame:  # reached it, or the user went elsewhere
                 self._resuming = None
                 self._player.settle_labels(session)
                 self._handle_waiting()
@@ -277,12 +277,12 @@ class Controller:
 
     # --- opening ---------------------------------------------------------------------------------
     def _open_soon(self, path: Path, opening: Callable[[], None]) -> None:
-        """Let `work` open it later, so that the page first says that this takes a moment."""
+        """Let `work` open it later, so that the page can first show the progress."""
         self._opening, self._of_before = (protocol.Progress.opening(path), opening), len(self._waiting)
         self._page.put(progress=self._opening[0], urgent=True)
 
     def _do_opening(self, opening: Callable[[], None]) -> None:
-        """Open the recording; if that is not possible, everything stays as it is."""
+        """Open the recording; if that is impossible, everything stays unchanged."""
         self._opening = None
         try:
             opening()
@@ -312,7 +312,7 @@ class Controller:
         self._take(session)
 
     def _reopen(self) -> None:
-        """Begin again with the present parameters. The user's work stays; loop edits only for the same keyframes."""
+        """Restart with the present parameters. User data stays; loop edits stay only if the keyframes are the same."""
         before, kept = self._need_session(), self._kept
         self._of_before = 0
         info, edits = before.feed.info, before.edits
@@ -344,7 +344,7 @@ class Controller:
             self._page.notice("warning", f"The session was compared with {state.truth}, which no longer exists.")
 
     def _take(self, session: Session, saved: SavedSession | None = None) -> None:
-        """Replace the present session by this one, at its first frame or at that of `saved`."""
+        """Replace the present session by this one, at its first frame or at the frame of `saved`."""
         if self._player.session is not None:
             self._player.session.close()
         self._leave_waiting()
@@ -352,12 +352,12 @@ class Controller:
         self._loops.clear()
         self._player.take(session)
         self._page.put(resumed=saved is not None)
-        if session.frame < 0:  # else it continues where a process died
+        if session.frame < 0:  # otherwise it continues where a process died
             state = saved.state if saved is not None else State(self._params)
             self._keep(Kept(**state.kept()))
         self._resuming = None
         if saved is not None:
-            # This process may die on the way there.
+            # Written now, since this process may die on the way there.
             self._writer.write(saved.frame, saved.state, ended=saved.ended, known=saved.known)
             session.resume(saved)
             self._player.resume(session, saved.frame, to_end=saved.ended)
@@ -391,7 +391,7 @@ class Controller:
         session = self._player.session
         if session is not None:
             session.finish_saves()
-            if self._resuming is None:  # else the target frame has been written already
+            if self._resuming is None:  # otherwise the target frame is already written
                 self._write(session)
             session.close()
         self._writer.close()

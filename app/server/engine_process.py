@@ -16,21 +16,21 @@ from app.slam.params import Params
 from app.slam.warmup import compile_kernels
 
 FRAME_PERIOD_S = 0.04
-"""s: frames are published no more often than this; answers to the user at once."""
+"""s: least period between published frames; answers to the user are published at once."""
 
 
 class Updates:
-    """Publishes deltas to the owner, one at a time, and takes its commands. The engine never waits for the owner."""
+    """Publishes deltas to the owner, one at a time, and takes its commands. The engine never waits for it."""
 
     def __init__(self, owner: Link, page: Publisher) -> None:
         self._owner, self._page = owner, page
         self._acknowledged, self._published = True, 0.0
 
     def exchange(self, wait: float | None) -> list[Command]:
-        """Send the changes, if the owner is ready and it is time. Returns the commands that have come.
+        """Send the changes if the owner is ready and a delta is due. Returns the commands received.
 
         Args:
-            wait: s to wait for commands, if none has come; None: without limit. Shorter if there is something to send.
+            wait: s to wait for commands if there are none; None: without limit. Shorter if there is something to send.
 
         Raises:
             LinkClosed: the owner is gone, or asks the engine to end.
@@ -46,7 +46,7 @@ class Updates:
         return commands or self._receive(wait)
 
     def _receive(self, wait: float | None) -> list[Command]:
-        """All commands that have come; if no message has, wait for one."""
+        """All commands received; if there is no message, wait for one."""
         commands = []
         while (message := self._owner.receive(wait)) is not None:
             if message == ACKNOWLEDGED:
@@ -58,7 +58,7 @@ class Updates:
 
 
 def main(owner: Link, setup: Setup) -> None:
-    """Compile, open the recording, and work until the owner asks to end or is gone."""
+    """Compile, open the recording, and work until the owner is gone or asks the engine to end."""
     revive = setup.revive
 
     def opener(path: Path, truth: Path | None, params: Params, part: tuple[float, float | None] | None) -> Session:
@@ -78,7 +78,7 @@ def run_loop(
     opener: OpenSession,
     prepare: Callable[[Callable[[str, float], None]], None] | None = None,
 ) -> None:
-    """As `main`, with functions that open a recording and that prepare the engine, reporting (name, fraction)."""
+    """As `main`, with given functions that open a recording and prepare the engine, reporting (name, fraction)."""
     page = Publisher(setup.params, setup.seen)
     updates = Updates(owner, page)
     controller = Controller(
@@ -103,6 +103,6 @@ def run_loop(
             for command in commands:
                 controller.handle(command)
             controller.relabel()
-            commands = updates.exchange(0.0 if commands else controller.work())  # first tell the page about long work
+            commands = updates.exchange(0.0 if commands else controller.work())  # announce long work to the page first
     except LinkClosed:
         controller.close()

@@ -1,7 +1,7 @@
 """Makes snapshots from deltas, in the reader's process.
 
 Some values are computed here instead of being sent: positions of frames and keyframes in the map, the distance
-travelled, the error to the truth.
+travelled, and the error to the truth.
 """
 
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ NOTICES_KEPT = 50
 class Fold:
     """Applies deltas to a snapshot. One thread writes; any thread may read `snapshot`, whose arrays never change.
 
-    It also keeps frames, keyframes and chunks after the frame shown. point_budget: most points of all chunks.
+    It also keeps frames, keyframes and chunks beyond the shown frame. point_budget: most points of all chunks.
     """
 
     def __init__(self, snapshot: Snapshot | None = None, point_budget: int = POINT_BUDGET) -> None:
@@ -37,7 +37,7 @@ class Fold:
         self._frames = Rows((), FRAME)
         self._positions = Rows((3,), np.float64)  # of frames, in the map
         self._corrections = MapFrame()
-        self._keyframes: I64 = np.empty(0, np.int64)  # their frames
+        self._keyframes: I64 = np.empty(0, np.int64)  # frame of each
         self._poses: F64 = np.empty((0, 4, 4))  # of keyframes, T_map_imu
         self._chunks: tuple[Chunk, ...] = ()
 
@@ -55,7 +55,7 @@ class Fold:
         self._take_chunks(delta, now)
         shown = min(now.transport.frame + 1, len(self._frames))
         keyframes = int(np.searchsorted(self._keyframes, shown))
-        poses = before.keyframe_poses  # the identical object tells the page that none has moved
+        poses = before.keyframe_poses  # the same object tells the page that none has moved
         if moved or keyframes != len(poses):
             poses = self._poses[:keyframes]
         T_map_truth, series = self._series(shown, now.recording)
@@ -72,14 +72,14 @@ class Fold:
         return self.snapshot
 
     def edit(self, *, notices: Iterable[Notice] = (), **values: Any) -> Snapshot:
-        """The next revision: fields replaced and notices added."""
+        """Make the next revision, with replaced fields and added notices."""
         before = self.snapshot
         kept = (*before.notices, *notices)[-NOTICES_KEPT:]
         self.snapshot = replace(before, revision=before.revision + 1, notices=kept, **values)
         return self.snapshot
 
     def _take_frames(self, delta: Delta, corrections: MapFrame) -> bool:
-        """Take in new frames and corrections. Returns whether a keyframe is new or may have moved."""
+        """Add new frames and corrections. Returns whether a keyframe is new or may have moved."""
         moved, cut = corrections is not self._corrections, delta.keep < len(self._frames)
         self._corrections = corrections
         self._frames.truncate(delta.keep)

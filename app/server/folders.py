@@ -29,7 +29,7 @@ class FolderEntry:
 
 
 class Folders:
-    """Folders given on the command line. Nothing outside them is listed or opened, not even through links.
+    """Folders given on the command line. Nothing outside is listed or opened, not even through links.
 
     Raises:
         HemislamError: one of them is not a folder.
@@ -46,7 +46,7 @@ class Folders:
         return Folders((*self.roots, folder)) if folder.is_dir() else self
 
     def inside(self, path: Path | str) -> Path:
-        """The real path behind `path`, relative to the first folder if it is not absolute.
+        """The real path of `path`, which is relative to the first folder if it is not absolute.
 
         Raises:
             HemislamError: it does not exist or lies outside; the message does not say which.
@@ -72,7 +72,7 @@ class Folders:
         return real
 
     def listing(self, folder: Path | str, suffixes: tuple[str, ...] = RECORDINGS) -> list[FolderEntry]:
-        """The contents of a folder inside: first its folders, then the files that may be chosen, each sorted by name.
+        """The contents of a folder inside: first folders, then files that may be chosen, each sorted by name.
 
         Unreadable entries and dangling links are left out.
 
@@ -88,7 +88,7 @@ class Folders:
         return sorted(found, key=lambda entry: (entry.is_choice, entry.path.name.casefold()))
 
     def sessions(self, kept: Path) -> list[tuple[Path, SavedSession]]:
-        """The newest session files in a folder, newest first: those that were begun and whose recording is inside."""
+        """The newest session files in a folder, newest first, if they have begun and their recording is inside."""
         found = []
         for path in session_files(kept)[:_RECENT]:
             try:

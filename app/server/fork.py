@@ -1,7 +1,7 @@
-"""Two settings side by side: the session A, and a fork B of it, which follows A from frame to frame.
+"""Two settings side by side: the session A, and its fork B, which follows A from frame to frame.
 
-The engine is deterministic, so a fork is a session file: A's frame, with other parameters. B is a second engine's
-process that opens this file and then seeks to whatever frame A is at. A never waits for B.
+The engine is deterministic, so a fork is a session file: A's session up to its frame, then other parameters. B is a
+second engine's process that opens this file and then seeks to A's frame. A never waits for B.
 """
 
 import re
@@ -56,7 +56,7 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
     """The session that continues from the frame of `a` with some parameters changed.
 
     Raises:
-        HemislamError: there is no frame yet, the session is not kept in a file, or a value is not possible.
+        HemislamError: there is no frame yet, the session is not kept in a file, or a value is invalid.
     """
     frame = a.transport.frame
     if frame < 0:
@@ -69,14 +69,14 @@ def forked(a: Snapshot, values: Mapping[str, Any]) -> SavedSession:
 
 
 def same_recording(a: Snapshot, b: Snapshot) -> bool:
-    """Whether frames of one can be compared with those of the other."""
+    """Whether frames of A and B can be compared."""
     if a.recording is None or b.recording is None:
         return False
     return a.recording.path.resolve() == b.recording.path.resolve() and a.recording.start_ns == b.recording.start_ns
 
 
 def follow(a: Snapshot, b: Snapshot) -> Seek | None:
-    """The seek that brings B to A's frame; None if it is there. At A's end, B goes to its end, for the last loops."""
+    """The seek that brings B to A's frame; None if B is there. At A's end, B goes to its end, for the last loops."""
     wanted, here = a.transport.frame, b.transport.frame
     if wanted < 0 or not same_recording(a, b) or (b.transport.finished and here <= wanted):
         return None
@@ -86,17 +86,17 @@ def follow(a: Snapshot, b: Snapshot) -> Seek | None:
 
 
 def engine_number(snapshot: Snapshot) -> int:
-    """The number of the engine that made a snapshot: 0 is the first engine, and each fork has its own number."""
+    """The number of the engine that made a snapshot: 0 for the first engine; each fork has its own number."""
     return snapshot.session // APART
 
 
 class Workspace:
-    """A and, while there is a fork, B. To the page and to scripts it is the engine A.
+    """A and, while there is a fork, B. The page and scripts use it like the engine A.
 
     All methods may be called by any thread.
 
     Args:
-        engine: A, at first the main session. setup: with which A was started; B is started in the same way.
+        engine: A, at first the main session. setup: with which A was started; B is started with it too.
         start: starts an engine.
     """
 
@@ -116,7 +116,7 @@ class Workspace:
         return self._sides[0].engine.snapshot
 
     def send(self, command: Command) -> None:
-        """Enqueue a command for A; a comparison is sent to B as well."""
+        """Enqueue a command for A; `CompareWith` is sent to B as well."""
         self._sides[0].engine.send(command)
         if isinstance(command, CompareWith):
             self.send_other(command)
@@ -161,7 +161,7 @@ class Workspace:
             a.engine.send(AddNote(f"{note} {session.left_out}"))
 
     def open(self, path: Path) -> None:
-        """Start B on a session file of A's recording. Raises HemislamError: it is of another one, or B exists."""
+        """Start B on a session file of A's recording. Raises HemislamError: the recording differs, or B exists."""
         with self._lock:
             a, folder = self._place(path.stem)
             session, session_file = read_session(path), a.engine.snapshot.session_file
@@ -173,7 +173,7 @@ class Workspace:
             a.engine.send(AddNote(f"Opened {path.name} beside this session. {session.left_out}"))
 
     def kept(self) -> list[Path]:
-        """Session files of A's recording that B can be opened on, the newest first."""
+        """Session files of A's recording that can be opened as B, the newest first."""
         a, folder = self._sides[0].engine.snapshot, self._setup.session_folder
         if folder is None or a.recording is None:
             return []
@@ -230,7 +230,7 @@ class Workspace:
             return path
 
     def close(self) -> None:
-        """End both; a fork that was neither kept nor discarded stays in its folder, to be opened again."""
+        """End both; a fork that was neither kept nor discarded stays in its folder and can be opened again."""
         with self._lock:
             self._ended.set()
             for side in self._sides:
@@ -297,5 +297,5 @@ class Workspace:
 
 
 def _plain(name: str) -> str:
-    """A name that any file system takes."""
+    """A name that any file system accepts."""
     return re.sub(r"[^\w.-]", "-", name).strip(".-")[:60] or "fork"

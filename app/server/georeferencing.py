@@ -16,15 +16,15 @@ log = logging.getLogger(__name__)
 
 
 class Georeferencing:
-    """Starts the work in a thread of the session and takes in its results; one thread calls `update`."""
+    """Starts the work in a thread of the session and collects its results; one thread calls `update`."""
 
     def __init__(self, page: Publisher) -> None:
-        self._page, self._earth = page, Earth()  # the latter as it is shown
-        self._begun_from: tuple[object, ...] = (None, None, (), -1, None)  # what the newest was begun with
+        self._page, self._earth = page, Earth()  # `_earth`: as shown on the page
+        self._begun_from: tuple[object, ...] = (None, None, (), -1, None)  # inputs of the newest work
         self._under_way: Future[Results] | None = None
 
     def choose(self, session: Session, survey: Survey | None) -> None:
-        """Georeference by this from now on. The page shows the choice at once, and the result once it is found."""
+        """Georeference by this survey from now on. The page shows the choice at once, and the result when available."""
         before = self._earth if self._begun_from[0] is session else Earth()
         session.survey = survey
         source = survey and (survey.gnss, survey.control)
@@ -35,7 +35,7 @@ class Georeferencing:
         """Show new results, and start again if needed. Returns whether work is in progress.
 
         Args:
-            still: the session stays at its frame. While it moves on, only the user's choices are followed at once.
+            still: whether the session stays at its frame. While it moves, only a choice of the user starts work.
         """
         if self._under_way is not None:
             if not self._under_way.done():
@@ -58,7 +58,7 @@ class Georeferencing:
         return True
 
     def _take(self, session: Session, work: Future[Results]) -> None:
-        """Show the result of the work, unless something else was chosen meanwhile."""
+        """Show the result of the work, unless the choice has changed meanwhile."""
         survey, error = session.survey, work.exception()
         if self._begun_from[:2] != (session, survey):
             return
@@ -82,5 +82,5 @@ class Georeferencing:
 
 
 def _levelling(session: Session) -> MapFrame:
-    """By the gravity known at the end. Before, the map would turn a little at every stop."""
+    """Level by the gravity known at the end. Earlier levelling would rotate the map slightly at every stop."""
     return session.levelling(session.map_frame) if session.ended else MapFrame()

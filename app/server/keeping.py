@@ -1,4 +1,4 @@
-"""Commands that change what a session keeps beside the map, and their effects."""
+"""Commands that change the user data of a session, such as notes and measures, and their effects."""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -9,25 +9,25 @@ from app.server.protocol import Command
 from app.slam.errors import HemislamError
 
 MOST_NOTES: Final = 1000
-"""These are limited because every page and every REST answer holds all of them."""
+"""Limits, because every page and every REST response holds all notes and measures."""
 MOST_VIEWS: Final = 6
 MOST_MEASURES: Final = 200
 
 
 class KeptCommand(Command, frozen=True):
-    """A change of what the session keeps beside the map."""
+    """A change of the session's user data."""
 
 
 class AddNote(KeptCommand, frozen=True):
-    """Keep a note on the present frame in the session."""
+    """Add a note on the present frame to the session."""
 
     text: str
 
 
 class EditNote(KeptCommand, frozen=True):
-    """Replace the text of the note with this place in `Snapshot.notes`; an empty text deletes it.
+    """Replace the text of a note, given by its index in `Snapshot.notes`; an empty text deletes it.
 
-    before: its text until now. If another page has changed the note meanwhile, it stays as it is.
+    before: its previous text. If another page has changed the note meanwhile, it stays unchanged.
     """
 
     place: int
@@ -36,19 +36,19 @@ class EditNote(KeptCommand, frozen=True):
 
 
 class KeepView(KeptCommand, frozen=True):
-    """Keep in the session where a camera stands and what it looks at."""
+    """Keep a camera's position and the point that it looks at in the session."""
 
     view: KeptView
 
 
 class KeepMeasure(KeptCommand, frozen=True):
-    """Keep in the session what was measured."""
+    """Keep a measure in the session."""
 
     measure: Measure
 
 
 class EditMeasure(KeptCommand, frozen=True):
-    """Give a measure of the session another name; an empty one deletes it."""
+    """Rename a measure of the session; an empty name deletes it."""
 
     measure: Measure
     name: str
@@ -61,7 +61,7 @@ class SetClip(KeptCommand, frozen=True):
 
 
 class Paint(KeptCommand, frozen=True):
-    """Mark points of a frame as ground or not, over what was marked before."""
+    """Mark points of a frame as ground or not; new marks override earlier ones."""
 
     stroke: Stroke
 

@@ -25,7 +25,7 @@ class LoopCommands:
         self._page.put(loops=self._view)
 
     def handle(self, command: LoopCommand, loops: LoopSchedule) -> None:
-        """Pass a command on; `update` brings the answer."""
+        """Pass a command on; `update` delivers the answer."""
         view = self._view
         match command:
             case EditLoop(edit):
@@ -44,11 +44,11 @@ class LoopCommands:
             case InspectLoop():
                 view = replace(view, inspected=None)
         if command != TryLoop(None):
-            loops.command(AskResiduals())  # for a trial, too: to compare with
+            loops.command(AskResiduals())  # also for a trial, which is compared with them
         self._show(view)
 
     def update(self, session: Session, *, show: bool = True) -> bool:
-        """Take in answers and, if `show`, show the state in effect. Returns whether answers are still to come."""
+        """Collect answers and, if `show`, show the state in effect. Returns whether answers are pending."""
         loops = session.loops
         if loops is None:
             return False
@@ -59,7 +59,7 @@ class LoopCommands:
                 case Answered(Inspect(older, newer), LoopDetail() as detail):
                     view = replace(view, inspected=((older, newer), detail))
                 case Answered(TryOut(command), Preview() as preview):
-                    poses = session.adjustment.poses(preview.poses)  # level, as the map is shown
+                    poses = session.adjustment.poses(preview.poses)  # levelled like the shown map
                     view = replace(view, tried=(command, replace(preview, poses=poses)))
                 case Answered(AskResiduals(), tuple() as residuals):
                     view = replace(view, residuals=residuals)

@@ -1,4 +1,4 @@
-"""Moves the open session through its frames: playing at a pace, stepping and seeking, both ways."""
+"""Moves the open session through its frames: playing at a speed, stepping and seeking in both directions."""
 
 import logging
 import re
@@ -23,18 +23,18 @@ log = logging.getLogger(__name__)
 SOURCE_PERIOD_S = 0.5
 SLOWEST = 0.1
 LONGEST_LAG_S = 0.5
-"""s: if playing is later than this, it does not catch up but continues from the present moment."""
+"""s: if playback lags by more than this, it does not catch up but continues from the present moment."""
 LONG_SEEK = 20
 """Progress is shown if at least this many frames must be processed on the way to a frame."""
 ONLY_ON = "A live source cannot go back; record it, then open the recording."
 FIRST_DOUBT = 100
-"""A run is first checked for doubts after this many frames, then after twice as many, and so on, and at the end."""
+"""A run is first checked for doubts after this many frames, then each time this number has doubled, and at the end."""
 _WARNINGS = ("disconnected", "silent", "jump", "recording", "units", "restarted")
 """Kinds of `Status` that are warnings, not just information."""
 
 
 class Pacer:
-    """Says when the next frame is due, at a chosen speed."""
+    """Computes when the next frame is due at a chosen speed."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -43,7 +43,7 @@ class Pacer:
         self._processed: deque[float] = deque(maxlen=100)
 
     def release(self) -> None:
-        """After a pause, a jump or a change of speed the next frame is due at once."""
+        """Make the next frame due at once, after a pause, a jump or a change of speed."""
         self._anchor = None
 
     def wait(self, stamp_ns: int) -> float:
@@ -70,7 +70,7 @@ class Pacer:
 
 @dataclass(frozen=True, slots=True)
 class SeekTarget:
-    """A frame to go to. origin: where the seek began. stepping: whether further steps are added to it."""
+    """A frame to go to. origin: where the seek began. stepping: whether further steps add to it."""
 
     frame: int
     origin: int
@@ -78,13 +78,13 @@ class SeekTarget:
 
 
 class Player:
-    """Takes a session from frame to frame and has the page show it. `work` does a short piece per call.
+    """Moves a session from frame to frame and shows it on the page. Each call of `work` does a short piece.
 
     Args:
         clock: monotonic seconds.
 
     Attributes:
-        session: the open one, or None. breakpoints: where playing pauses.
+        session: the open session, or None. breakpoints: conditions at which playback pauses.
         page_behind: whether the page does not show the session's frame yet.
         relabelling: whether the ground of the frame shown must be segmented again, with the present parameters.
     """
@@ -102,7 +102,7 @@ class Player:
 
     # --- requests --------------------------------------------------------------------------------
     def take(self, session: Session) -> None:
-        """Begin with another session, at its frame, or at its first one."""
+        """Begin with another session, at its present frame or at its first one."""
         self.session = session
         self.relabelling = self.page_behind = False
         self._moment = None
@@ -171,7 +171,7 @@ class Player:
         if as_it_was is not None:
             try:
                 session.go_to(as_it_was)
-                while session.result is None and session.revisits:  # a pause must have something to show
+                while session.result is None and session.revisits:  # when paused, there must be a frame to show
                     session.advance()
             except Exception as error:
                 self.fail("Cannot go back", error)
@@ -183,7 +183,7 @@ class Player:
 
     # --- work ------------------------------------------------------------------------------------
     def work(self) -> float | None:
-        """Do the next piece of work; returns as `Controller.work`."""
+        """Do the next piece of work. Returns as `Controller.work`."""
         session, target = self.session, self._target
         if session is None:
             return None
@@ -195,7 +195,7 @@ class Player:
         return self._advance(session, target)
 
     def look_at_source(self, session: Session) -> float | None:
-        """Show the state of a live source now and then. Returns seconds until the next look."""
+        """Show the state of a live source periodically. Returns seconds until the next time."""
         if self._page.transport.finished or session.feed.info.duration_s is not None:
             return None
         now = self._clock()
@@ -208,7 +208,7 @@ class Player:
                 self._page.show(finished=True)
                 return None
             self._page.put(live=state, recording=opened_recording(session))
-            if self._page.transport.playing:  # also if it sends nothing any more
+            if self._page.transport.playing:  # even if it no longer sends anything
                 self._page.show(frames_per_second=self._pacer.rate(), urgent=False)
         return SOURCE_PERIOD_S
 
@@ -271,7 +271,7 @@ class Player:
         return 0.0
 
     def _doubt(self, session: Session) -> None:
-        """Report why the run cannot be right, each reason once."""
+        """Report why the run may be wrong, each reason once."""
         for doubt in doubts(session.log, session.loops.tied_ns if session.loops else NO_PAUSES):
             reason = re.sub(r"[\d.]+", "#", doubt)
             if reason not in self._doubted:
@@ -289,7 +289,7 @@ class Player:
             self._page.notice("info", f"Paused at frame {session.frame:,}. {' '.join(why)}")
 
     def _catch_up(self) -> None:
-        """Show the frame that the session is at, if the page does not."""
+        """Show the session's frame if the page does not show it yet."""
         session = self.session
         if self.page_behind and session is not None:
             self.page_behind = False
@@ -298,7 +298,7 @@ class Player:
             self.settle_labels(session)
 
     def settle_labels(self, session: Session) -> None:
-        """Relabel the frame if it was processed with other ground parameters."""
+        """Relabel the frame if it was processed with different ground parameters."""
         then = session.params_of(session.frame)
         changed = then.changed(session.params) if then is not None else {}
         self.relabelling = any(EFFECT[path] == "now" for path in changed)

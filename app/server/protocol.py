@@ -29,16 +29,16 @@ from app.slam.types import F32, F64, I64, U8, U16, StepResult
 LIVE = Path("live")
 """Stands for the live source wherever a recording is named."""
 ACKNOWLEDGED = "acknowledged"
-"""Sent to the engine in answer to each delta: it may send the next one."""
+"""Sent to the engine in answer to each delta: the engine may send the next one."""
 
 
 # --- commands ------------------------------------------------------------------------------------
 class Command(msgspec.Struct, frozen=True):
-    """Something the user asks of the engine."""
+    """A request of the user to the engine."""
 
 
 class Play(Command, frozen=True):
-    """Play at the chosen speed; at the end of a recording, play again from its first frame, as by `Seek`."""
+    """Play at the chosen speed; at the end of a recording, play again from the first frame, as after `Seek(0)`."""
 
 
 class Pause(Command, frozen=True):
@@ -67,13 +67,13 @@ class Seek(Command, frozen=True):
 
 
 class SetBreakpoints(Command, frozen=True):
-    """From now on, pause at frames that meet one of these."""
+    """From now on, pause at frames that meet one of these conditions."""
 
     breakpoints: Breakpoints
 
 
 class Georeference(Command, frozen=True):
-    """Georeference the map by these fixes or control points from now on; None: no longer."""
+    """From now on, georeference the map by these fixes or control points; None: stop georeferencing."""
 
     survey: Survey | None
 
@@ -98,23 +98,23 @@ class OpenRecording(Command, frozen=True):
 
 
 class CompareWith(Command, frozen=True):
-    """Compare the trajectory with another one (TUM): the truth, or that of another run or program. None: with none."""
+    """Compare the trajectory with another one (TUM): the truth, or the result of another run or program. None: stop."""
 
     path: Path | None
 
 
 class Calibrated(Command, frozen=True):
-    """Keep for the report what the recording shows about its sensors, in a sentence; "": nothing."""
+    """Keep a sentence for the report on what the recording shows about its sensors; "": nothing."""
 
     text: str
 
 
 class Restart(Command, frozen=True):
-    """Start the present recording again with the present parameters, the loop edits and the notes."""
+    """Restart the present recording with the present parameters; loop edits and notes stay."""
 
 
 class Save(Command, frozen=True):
-    """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` reports when.
+    """Write the results of the frames so far, replacing older ones in the folder; `Snapshot.saved` reports the end.
 
     Attributes:
         formats: as in `hemislam export`; none: all files of a run. choice: of points, as in `hemislam export`.
@@ -128,7 +128,7 @@ class Save(Command, frozen=True):
 
 
 class EditLabels(Command, frozen=True):
-    """Give the points of a keyframe other labels (as in `Cloud`): one each, in their order, or all the same."""
+    """Change the labels (as in `Cloud`) of a keyframe's points: one label for all, or one per point in order."""
 
     keyframe: int
     labels: tuple[int, ...] | int
@@ -153,17 +153,17 @@ class UndoLoop(LoopCommand, frozen=True):
 
 
 class RedoLoop(LoopCommand, frozen=True):
-    """Repeat the edit that was undone last."""
+    """Repeat the last undone edit."""
 
 
 class TryLoop(LoopCommand, frozen=True):
-    """Show in `LoopsView.tried` what the graph would become with an edit, without applying it; None: show nothing."""
+    """Show the effect of an edit on the graph in `LoopsView.tried`, without applying it; None: show nothing."""
 
     command: LoopEdit | None
 
 
 class InspectLoop(LoopCommand, frozen=True):
-    """Show in `LoopsView.inspected` all that is known of a candidate; None: show nothing."""
+    """Show all details of a candidate in `LoopsView.inspected`; None: show nothing."""
 
     pair: loops.Pair | None
 
@@ -178,7 +178,7 @@ class Chunk:
     Attributes:
         index, frame, stamp_ns: of the keyframe. T_imu_lidar: (4, 4).
         points: (n, 3) float32 m, LiDAR frame. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
-        level: how often it was thinned. joined: how many keyframes' points it took over.
+        level: how often it was thinned. joined: number of keyframes whose points it took over.
     """
 
     index: int
@@ -195,7 +195,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class OpenedRecording:
-    """The open recording, or the part of it that is processed: from `start_s` to `end_s` after `start_ns`."""
+    """The open recording, or the processed part of it, from `start_s` to `end_s` after `start_ns`."""
 
     path: Path
     start_ns: int
@@ -207,7 +207,7 @@ class OpenedRecording:
     """(m, 3) positions of the IMU, in the truth's own frame."""
     truth: Path | None = None
     fixes: bool = False
-    """Whether it holds satellite fixes."""
+    """Whether the recording holds satellite fixes."""
     start_s: float = 0.0
 
     @property
@@ -289,10 +289,10 @@ error_m: to the truth (m), aligned to all frames shown."""
 
 @dataclass(frozen=True, slots=True)
 class Earth:
-    """Where on Earth the map is.
+    """Georeference of the map.
 
     Attributes:
-        survey: the fixes or control points that georeference it; None: none.
+        survey: the fixes or control points to use; None: none.
         found: their alignment with the map; None until it is known.
         problem: why they cannot be aligned, in a sentence.
     """
@@ -308,12 +308,12 @@ _NO_POSES, _NO_POSITIONS = np.empty((0, 4, 4)), np.empty((0, 3))
 
 @dataclass(frozen=True, slots=True)
 class Snapshot(Kept):
-    """All that the page draws, as one immutable value.
+    """Everything that the page draws, as one immutable value.
 
     Attributes:
         session: increases when a recording is opened or restarted. revision: increases with every snapshot.
-        params: as chosen. pending_restart: names of changed ones that take effect only on restart.
-        result: of the newest frame, with the present ground parameters and without its `keyframe`.
+        params: as chosen. pending_restart: names of changed parameters that take effect only on restart.
+        result: of the newest frame, labelled with the present ground parameters, without its `keyframe`.
         chunks: of all keyframes up to the frame. keyframe_poses: (k, 4, 4) T_map_imu.
         trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops and by
             `adjustment`, which levels or georeferences the map.
@@ -321,8 +321,8 @@ class Snapshot(Kept):
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
         notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
-        earth: for the map as it was when the session last stood still.
-        session_file: keeps this session; opening it continues the session. resumed: whether that was done.
+        earth: for the map when the session last stood still.
+        session_file: keeps this session; opening it resumes the session. resumed: whether this session was resumed.
     """
 
     session: int = 0
@@ -361,9 +361,9 @@ class Delta:
     """Changes since the last delta.
 
     Attributes:
-        replaced: new values of fields of `Snapshot`; `loops` without its edges. With `session`, another session
-            begins: the reader drops its edges.
-        edges: those that changed. keep: how many of its frames the reader keeps before it appends `frames`.
+        replaced: new values of fields of `Snapshot`; `loops` without its edges. If it contains `session`, another
+            session begins, and the reader drops its edges.
+        edges: changed edges. keep: how many of its frames the reader keeps before it appends `frames`.
         chunks: of the next keyframes, and of earlier ones whose labels changed. notices: new ones.
     """
 

@@ -1,7 +1,7 @@
-"""Collects changes for the page, in the engine's process, and makes deltas from them.
+"""Collects changes for the page in the engine's process, and makes deltas from them.
 
-Of most fields, only the newest value is sent. A cursor follows the frames, and clouds are read from disk when they are
-sent. So a slow reader never delays the engine and misses nothing, and nothing piles up for it.
+For most fields, only the newest value is sent. A cursor follows the frames, and clouds are read from disk when they are
+sent. So a slow reader never delays the engine and misses nothing, and no data accumulates for it.
 """
 
 import re
@@ -22,14 +22,14 @@ from app.slam.ply import Keyframes
 from app.slam.types import StepResult
 
 CHUNKS_AT_ONCE = 20
-"""Most clouds in one delta, so that a reader far behind sees the map grow."""
+"""Most clouds in one delta, so that a reader that is far behind sees the map grow."""
 REPEAT_AFTER_S = 10.0
-"""Recording time after which the same kind of notice is shown again."""
+"""Recording time after which a notice of the same kind is shown again."""
 SAVED_KEPT = 10
 
 
 def opened_recording(session: Session) -> OpenedRecording:
-    """Describe a session's source. A source without an end is as long as the processed part."""
+    """Describe a session's source. The duration of a source without an end is that of the processed part."""
     info, truth = session.feed.info, session.truth
     newest = session.frames[session.frame] if session.frame >= 0 else None
     so_far_s = (newest.stamp_ns - info.start_ns) * 1e-9 if newest is not None else 0.0
@@ -51,11 +51,11 @@ class Publisher:
     """Turns a session's events into deltas.
 
     Args:
-        seen: what the reader already has.
+        seen: counts that the reader already has.
 
     Attributes:
         urgent: whether the next delta is needed at once, whatever the rate limit.
-        transport: as last shown. result: of the frame shown, without its keyframe.
+        transport: as last shown. result: of the shown frame, without its keyframe.
     """
 
     def __init__(self, params: Params, seen: Seen = NOTHING_SEEN) -> None:
@@ -70,7 +70,7 @@ class Publisher:
         self._notices: list[Notice] = []
         self._frames: Log[Frame] = Log()
         self._clouds: Keyframes = ()
-        # What the reader has:
+        # State of the reader:
         self._edges: tuple[LoopEdge, ...] = ()
         self._cursor = Cursor(0, seen.frames)
         self._keyframes: list[int] = []  # their frames
@@ -110,14 +110,14 @@ class Publisher:
 
     @property
     def filled(self) -> bool:
-        """Whether there is anything to take."""
+        """Whether there are changes to take."""
         again = any(map(self._readable, self._again))
         behind = again or self._frames.cursor != self._cursor or self._chunks < self._chunks_ready
         return bool(self._replaced or self._notices or behind)
 
     @property
     def _chunks_ready(self) -> int:
-        """Keyframes whose cloud can be read: after a seek back, only those up to the session's frame."""
+        """Number of keyframes whose cloud can be read: after a seek back, only those up to the session's frame."""
         return min(len(self._keyframes), len(self._clouds))
 
     def _readable(self, keyframe: int) -> bool:
@@ -136,7 +136,7 @@ class Publisher:
         self._chunks = first = min(self._chunks, kept)
         self._chunks = max(first, min(self._chunks_ready, first + CHUNKS_AT_ONCE))
         shown = {index for index in self._again if index < first}
-        again = sorted(filter(self._readable, shown))  # others follow once the session is at their frames again
+        again = sorted(filter(self._readable, shown))  # others follow when the session reaches their frames again
         chunks = tuple(thinned(self._clouds[index]) for index in (*again, *range(first, self._chunks)))
         delta = Delta(self._replaced, edges, keep, frames, chunks, tuple(self._notices))
         self._replaced, self._notices, self._again, self.urgent = {}, [], shown.difference(again), False
@@ -144,7 +144,7 @@ class Publisher:
 
     # --- events ----------------------------------------------------------------------------------
     def opened(self, session: Session) -> None:
-        """Show another session, from its first frame on, or from where an earlier process left it."""
+        """Show another session, from its first frame or from the frame at which an earlier process left it."""
         self.begin(session.frames, session.keyframes)
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
         self.put(recording=opened_recording(session))
@@ -167,7 +167,7 @@ class Publisher:
             self.notice_once(notice, result.stamp_ns)
 
     def arrived(self, session: Session, result: StepResult | None) -> None:
-        """Show the known frame to which the session went."""
+        """Show the frame to which the session has gone."""
         self._show_frame(session, result)
         stamp_ns = result.stamp_ns if result else 0
         self.show(frame=session.frame, stamp_ns=stamp_ns, finished=session.ended, dropped=session.dropped)
@@ -184,7 +184,7 @@ class Publisher:
             self.put(corrections=self._corrections, adjustment=session.adjustment)
 
     def relabelled(self, result: StepResult) -> None:
-        """Show other labels of the frame."""
+        """Show new labels of the frame."""
         self.result = result
         self.put(result=result, urgent=True)
 

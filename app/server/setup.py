@@ -1,4 +1,4 @@
-"""The settings with which an engine's process is started."""
+"""The settings for starting an engine's process."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from app.slam.params import Params
 POINT_BUDGET = 3_000_000
 """Most map points that a page draws."""
 HELD = 3
-"""The server holds this many times as many, 220 MB, so that each page can show details of the part that it views."""
+"""The server holds this multiple of that number, 220 MB, so that each page can show details of the part in view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +30,15 @@ NOTHING_SEEN = Seen()
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """The settings with which an engine's process starts. Must be picklable.
+    """The settings for starting an engine's process. Must be picklable.
 
     Attributes:
-        recording: to open; None: wait for OpenRecording. start_s, duration_s: the part to process.
-        resolve, session_folder: see `Controller`. play: begin at once.
+        recording: the one to open; None: wait for OpenRecording. start_s, duration_s: the part to process.
+        resolve, session_folder: see `Controller`. play: start playback at once.
         point_budget: most points of the map that a page draws. checkpoint_bytes: memory for checkpoints.
-        live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: for files that a process needs
-            to take over. revive: whether this process takes over. seen: counts that the reader already has.
-        kept: by a live session that another process began.
+        live: source of scans if `recording` is `app.server.protocol.LIVE`. live_folder: for files from which another
+            process can take over. revive: whether this process takes over. seen: counts that the reader already has.
+        kept: user data of a live session that another process began.
     """
 
     recording: Path | None = None

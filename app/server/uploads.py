@@ -1,4 +1,4 @@
-"""Recordings that are dropped on the page: they arrive piece by piece, each no longer than any other request."""
+"""Recordings dropped on the page: they arrive in pieces, each within the size limit of a request."""
 
 import glob
 import shutil
@@ -9,22 +9,22 @@ from app.server.folders import RECORDINGS, TRAJECTORIES, Folders
 from app.slam.errors import HemislamError
 
 SUFFIXES: Final = (*RECORDINGS, *TRAJECTORIES, ".yaml", ".json")
-"""Recordings and sessions, and files that belong to them: a truth, parameters, an Ouster's metadata."""
+"""Suffixes of recordings and sessions, and of files that belong to them: truth, parameters, an Ouster's metadata."""
 _LONGEST_NAME: Final = 200
-"""Most bytes of a name; with what is added to it, file systems allow 255."""
+"""Most bytes of a name; with our additions, it must stay within the 255 bytes that file systems allow."""
 _LEFT_FREE: Final = 1 << 30
-"""Bytes of the disk that uploads leave free."""
+"""Bytes on the disk that uploads leave free."""
 
 
 def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes, copy: str = "") -> None:
-    """Append a piece to a file in the first folder. With its last piece, the file gets its name.
+    """Append a piece to a file in the first folder. After the last piece, the file gets its final name.
 
     Args:
         offset: bytes that came before. size: of the whole file, bytes.
-        copy: letters that tell this copy from others of the same name. The copy that began last continues.
+        copy: identifies this copy among others of the same name. The copy that began last continues.
 
     Raises:
-        HemislamError: the name or the size cannot be taken, a piece is missing, or it cannot be written.
+        HemislamError: the name or the size is not allowed, a piece is missing, or the file cannot be written.
     """
     there = _place(folders, name)
     if there.exists() or there.is_symlink():
@@ -48,7 +48,7 @@ def receive(folders: Folders, name: str, offset: int, size: int, piece: bytes, c
 
 
 def discard(folders: Folders, name: str) -> None:
-    """Remove the pieces of a file that did not arrive as a whole. Raises HemislamError as `receive` does."""
+    """Remove the pieces of an incomplete file. Raises HemislamError as `receive` does."""
     there = _place(folders, name)
     for part in there.parent.glob(f".{glob.escape(name)}.*.part"):
         part.unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 """Everything in app/ that depends on viser's internals.
 
-`tests/server/test_adapters.py` shows which of these an upgrade of viser has changed, and that no other module uses any.
+`tests/server/test_adapters.py` shows what an upgrade of viser has changed, and that no other module uses internals.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ MOST_AT_ONCE: Final = 32
 """Most updates in one message to a page. viser would send 128, and each message is copied several times per page."""
 
 CLIENT: Final = Path(viser.__file__).parent / "client" / "build" / "index.html"
-"""viser's page: one file that holds everything."""
+"""viser's page: one self-contained file."""
 TITLE: Final = "<title>Viser</title>"
 BODY_END: Final = "</body>"
 
@@ -65,10 +65,10 @@ class Viser:
 def start_viser() -> Viser:
     """Start viser on a free loopback port that answers only to our bridge.
 
-    viser itself accepts every Origin, so any web page that the user has open could drive it.
+    viser itself accepts every Origin, so any web page open in the user's browser could control it.
     """
     key = secrets.token_urlsafe(24)
-    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection")  # a page may leave at any moment
+    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection")  # a page may disconnect at any moment
     _list_icons_once()
     with _require_key(key), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -84,7 +84,7 @@ def _list_icons_once() -> None:
 
 @contextlib.contextmanager
 def _require_key(key: str) -> Iterator[None]:
-    """While this is open, a WebSocket server that viser starts refuses requests without the key.
+    """While this context is active, a WebSocket server started by viser refuses requests without the key.
 
     viser has no option for this, so websockets' `serve` is replaced until viser has called it. A browser cannot send
     the header.
@@ -109,10 +109,10 @@ def _require_key(key: str) -> Iterator[None]:
 
 
 def is_readable(kind: str, raw: bytes) -> bool:
-    """Whether viser can handle a message of a page. It would log a traceback for one that it cannot read.
+    """Whether viser can handle a message of a page. For an unreadable message, it would log a traceback.
 
     Args:
-        kind: what the message says it is. raw: all of it, as msgpack.
+        kind: type stated in the message. raw: the whole message as msgpack.
     """
     try:
         with warnings.catch_warnings():
@@ -121,18 +121,18 @@ def is_readable(kind: str, raw: bytes) -> bool:
         if kind != "ViewerCameraMessage":
             return True
         camera = vars(msgspec.convert(vars(read), viser._messages.ViewerCameraMessage, strict=True))
-    except Exception:  # whatever a message of any content may cause in there
+    except Exception:  # a message with arbitrary content may cause any error
         return False
     numbers = [n for value in camera.values() for n in (value if isinstance(value, tuple) else (value,))]
     return all(isinstance(n, int | float) and math.isfinite(n) and abs(n) < 1e12 for n in numbers)
 
 
 def page_html() -> str:
-    """viser's page under our title, with our sizes of points."""
+    """viser's page with our title and our limits on point sizes."""
     return with_point_sizes(CLIENT.read_text(encoding="utf-8")).replace(TITLE, "<title>hemislam</title>", 1)
 
 
 def viewer_html(page: str) -> str:
-    """The same page with a badge that says that it is view only."""
+    """The same page with a badge that marks it as view only."""
     head, body_end, rest = page.rpartition(BODY_END)
     return f"{head}{BADGE}{body_end}{rest}"

@@ -38,9 +38,9 @@ from app.slam.errors import HemislamError
 log = logging.getLogger(__name__)
 
 MOST_PAGES: Final = 32
-"""Most open pages with the view-only token, and again as many others. Each takes a megabyte or two."""
+"""Most open pages with the view-only token; the same limit applies to other pages. Each takes a megabyte or two."""
 MOST_CONNECTIONS: Final = 500
-"""Beyond that, requests are answered with status 503."""
+"""Most concurrent requests; further requests are answered with status 503."""
 
 
 class ServedPage(Protocol):
@@ -54,14 +54,14 @@ BuildPage = Callable[[viser.ViserServer, Workspace, Folders], ServedPage]
 
 
 class _AsciiJson(JSONResponse):
-    """JSON in ASCII: an error message may quote half a surrogate pair, which UTF-8 cannot encode."""
+    """JSON in ASCII: an error message may quote a lone surrogate, which UTF-8 cannot encode."""
 
     def render(self, content: object) -> bytes:
         return json.dumps(content).encode("ascii")
 
 
 def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Access) -> FastAPI:
-    """Everything that can be reached from outside."""
+    """The application with everything that can be reached from outside."""
     app = FastAPI(
         title="hemislam",
         version=__version__,
@@ -72,7 +72,7 @@ def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Acc
     app.add_middleware(Guard, access=access)
     page = page_html()
     viewers_page = viewer_html(page)
-    pages: Counter[bool] = Counter()  # open pages, by whether they are view only
+    pages: Counter[bool] = Counter()  # open pages, by whether they are view-only
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     def index(request: Request) -> str:
@@ -93,7 +93,7 @@ def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Acc
 
     @app.get("/healthz")
     def health(response: Response) -> dict[str, str]:
-        """200, or 503 if the engine or the live source has ended for good."""
+        """Status 200, or 503 if the engine or the live source has ended for good."""
         snapshot = engine.snapshot
         source_ended = snapshot.live is not None and snapshot.transport.finished
         if snapshot.engine_alive and not source_ended:
@@ -128,8 +128,8 @@ def run_server(
     """Serve the workbench until Ctrl-C or SIGTERM, then end the engine's process and everything else.
 
     Args:
-        setup: of the engine. folders: that the page may open. build_page: makes the page.
-        host, port: to bind to; port 0: a free one. On an address that others can reach, the printed link has a token.
+        setup: of the engine. folders: those that the page may open. build_page: makes the page.
+        host, port: to bind to; port 0: a free one. If others can reach the address, the printed link has a token.
         open_browser: open the page, if there is a display. start_engine: replaced only in tests.
         tls: certificate and key for https.
 
@@ -167,7 +167,7 @@ def run_server(
 
 
 def log_notices(engine: RunningEngine) -> None:
-    """Log the notices that the engine publishes, without end. Run this in a thread of its own."""
+    """Log the engine's notices, endlessly. Run this in a thread of its own."""
     if not log.isEnabledFor(logging.INFO):
         return  # people read them on the page
     logged: set[int] = set()
@@ -182,7 +182,7 @@ def log_notices(engine: RunningEngine) -> None:
 
 
 def show_compilation(engine: EngineProcess) -> None:
-    """Show a progress bar in the terminal while the engine compiles, a minute at the first start."""
+    """Show a progress bar in the terminal while the engine compiles, which takes a minute at the first start."""
     with tqdm(total=1.0, disable=None, leave=False, bar_format="{desc}: {percentage:3.0f}% |{bar}|") as bar:
         snapshot = engine.snapshot
         while snapshot.engine_alive and (snapshot.revision == 0 or snapshot.progress is not None):
@@ -200,7 +200,7 @@ class Tls:
     key: Path | None = None
 
     def check(self) -> None:
-        """Raises HemislamError: the files cannot be used."""
+        """Load the files. Raises HemislamError: they cannot be used."""
         try:
             ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(self.certificate, self.key)
         except OSError as error:  # SSLError is a subclass
@@ -211,7 +211,7 @@ class Tls:
 
 
 def make_server(app: FastAPI, tls: Tls | None = None) -> uvicorn.Server:
-    """The server that runs the app. It compresses nothing: on this machine that would cost more than it saves."""
+    """The server that runs the app. It does not compress, which would cost more than it saves on one machine."""
     return uvicorn.Server(
         uvicorn.Config(
             app,

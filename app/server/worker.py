@@ -1,6 +1,6 @@
-"""The engine in a process of its own, started and watched from here.
+"""Starts and watches the engine in a process of its own.
 
-The process sends the next delta when the last one has been acknowledged. So a slow reader gets few large deltas.
+The process sends the next delta after the last one was acknowledged. So a slow reader gets few large deltas.
 """
 
 import math
@@ -16,19 +16,19 @@ from app.server.protocol import ACKNOWLEDGED, LIVE, Command, Notice, OpenRecordi
 from app.server.setup import HELD, Seen, Setup
 
 MOST_RESTARTS: Final = 25
-"""Most deaths after which the engine's process is restarted automatically."""
+"""Most automatic restarts of the engine's process after its death."""
 
 Main = Callable[[Link, Setup], None]
 
 
 def _run_engine(owner: Link, setup: Setup) -> None:
-    from app.server.engine_process import main  # this process has no need of the engine and its compiler
+    from app.server.engine_process import main  # this process does not need the engine and its compiler
 
     main(owner, setup)
 
 
 class RunningEngine(Protocol):
-    """The interface of an engine's process: `EngineProcess`, or the workspace of two."""
+    """The interface of a running engine: `EngineProcess`, or the workspace of two engines."""
 
     @property
     def snapshot(self) -> Snapshot: ...
@@ -70,9 +70,9 @@ class EngineProcess:
             return self.snapshot
 
     def send(self, command: Command) -> None:
-        """Enqueue a command. Restart and OpenRecording start a dead engine again; other commands to it are lost."""
+        """Enqueue a command. Restart and OpenRecording restart a dead engine; other commands to it are lost."""
         if isinstance(command, Restart | OpenRecording):
-            with self._restarting:  # a second caller finds the process alive
+            with self._restarting:  # a second caller then finds a live process
                 if not self.snapshot.engine_alive:
                     self.restart(command)
                     return
@@ -80,7 +80,7 @@ class EngineProcess:
             child.send(command)
 
     def restart(self, command: Restart | OpenRecording | None = None) -> None:
-        """Start a new process with the newest parameters, at the first frame of the command's or the open recording."""
+        """Start a new process with the newest parameters at the first frame of the command's or the open recording."""
         self.close(timeout=0)
         last, setup = self.snapshot, self._next_setup(play=False)
         if isinstance(command, OpenRecording):
@@ -93,8 +93,8 @@ class EngineProcess:
         self._edit(engine_alive=True)
 
     def close(self, timeout: float | None = None) -> None:
-        """Let the process finish writing and end; kill it after the time (s)."""
-        child, self._child = self._child, None  # from now on its end is expected
+        """Let the process finish writing and exit; kill it after the time (s)."""
+        child, self._child = self._child, None  # from now on, its exit is expected
         if child is not None:
             child.close(timeout)
 
@@ -109,7 +109,7 @@ class EngineProcess:
                 delta = child.receive()
                 child.send(ACKNOWLEDGED)
                 with self._changed:
-                    if child is not self._child:  # another one has taken over
+                    if child is not self._child:  # another process has taken over
                         return
                     self._fold.apply(delta)
                     self._changed.notify_all()
@@ -118,7 +118,7 @@ class EngineProcess:
                 self._died(death)
 
     def _died(self, death: ChildDied) -> None:
-        """Report the death, and start the process again if its session was kept."""
+        """Report the death, and restart the process if its session was kept."""
         last = self.snapshot
         place = last.session_file or (LIVE if last.live is not None else None)
         restarts = place is not None and self._restarts.allows()
@@ -135,7 +135,7 @@ class EngineProcess:
         self._start(replace(setup, recording=place, revive=True, seen=seen))
 
     def _next_setup(self, *, play: bool) -> Setup:
-        """The setup of the next process: parameters and settings as they are now."""
+        """The setup of the next process, with the present parameters and settings."""
         last = self.snapshot
         return replace(
             self._setup,
