@@ -65,7 +65,7 @@ def verdict(state: LiveState, *, paused: bool = False) -> tuple[str, str]:
 def _tiles(state: LiveState) -> Iterator[Tile]:
     counted = state.counters
     for name, rate, age in (("LiDAR", state.lidar_hz, state.lidar_age_s), ("IMU", state.imu_hz, state.imu_age_s)):
-        last = "nothing came yet" if age is None else f"last {_age(age)} ago"
+        last = "nothing received yet" if age is None else f"last {_age(age)} ago"
         colour = QUIET if age is None else BAD if age > SILENT_S else WARN if age > OLD_S else GOOD
         yield Tile(name, number(rate, 1), "Hz", last, colour, "half")
     lost, of = counted.lost, counted.packets + counted.lost
@@ -76,7 +76,7 @@ def _tiles(state: LiveState) -> Iterator[Tile]:
     yield Tile("not usable", f"{bad:,}", "", "packets", WARN if bad else "")
     yield Tile("duplicates", f"{counted.duplicates:,}", "", "packets, ignored")
     colour = BAD if counted.dropped else GOOD
-    yield Tile("scans dropped", f"{counted.dropped:,}", "", "the oldest first; never IMU", colour, "half")
+    yield Tile("scans dropped", f"{counted.dropped:,}", "", "oldest scans first; never IMU data", colour, "half")
     colour = WARN if state.backlog > BUSY_BACKLOG else ""
     yield Tile("waiting", f"{state.backlog:,}", "scans", "for the engine", colour, "half")
     offset = state.imu_lag_s

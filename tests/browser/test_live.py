@@ -33,7 +33,7 @@ def test_the_panel_is_there_while_a_source_is_live_and_shows_when_it_is_not_well
     expect(heading).to_be_visible()
     for words in ("RS-Bpearl 68656d690001: 600 rpm, strongest return", "receiving", "last 30 ms ago", "12 MB"):
         expect(page.get_by_text(words)).to_be_visible()
-    for words in ("IMU behind LiDAR", "the oldest first; never IMU"):
+    for words in ("IMU behind LiDAR", "oldest scans first; never IMU data"):
         box = page.get_by_text(words).bounding_box()
         assert box is not None and PANEL[0] <= box["x"] and box["x"] + box["width"] <= PANEL[1], "nothing is cut off"
     worse = replace(WELL, lidar_age_s=4.2, counters=Counters(packets=151_000, lost=3_000, frames=1000, dropped=21))

@@ -47,7 +47,9 @@ def test_each_reading_has_its_unit() -> None:
 def test_what_is_not_known_is_a_dash_and_not_zero() -> None:
     text = shown(LiveState())
     assert (
-        "IMU behind LiDAR – ms" in text and "nothing came yet" in text and "recorded – off; start with --record" in text
+        "IMU behind LiDAR – ms" in text
+        and "nothing received yet" in text
+        and "recorded – off; start with --record" in text
     )
 
 

@@ -1,4 +1,4 @@
-// Files dropped on the page are copied into the first folder in pieces that fit into a request, and the recording opens.
+// Dropped files are copied into the first folder in pieces that fit into a request; then the recording opens.
 if (!window.hemislamDrop) {
   window.hemislamDrop = true;
   const PIECE = 1 << 19;
@@ -56,7 +56,7 @@ if (!window.hemislamDrop) {
     busy = true;
     try {
       if (!last?.size) throw new Error('This is empty or a folder; copy folders to where hemislam was started, and open them from there.');
-      for (const file of files) await copy(file); // what lies beside a recording comes first
+      for (const file of files) await copy(file); // files that belong to a recording come before it
       if (RECORDING.test(last.name))
         await ask('', {method: 'POST', body: JSON.stringify({path: last.name}), headers: {'Content-Type': 'application/json'}});
       hide();

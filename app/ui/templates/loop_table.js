@@ -1,4 +1,4 @@
-// The whole table is put in anew at every change: keep where it was scrolled to, but show a row that was just chosen.
+// The whole table is replaced at every change: keep the scroll position, but show a row that was just chosen.
 const box = this.parentNode, row = box.querySelector('[aria-selected=true]');
 box.scrollTop = window.hemislamTableScroll || 0;
 if (row && row.dataset.hs !== window.hemislamRow) {

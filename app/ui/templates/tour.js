@@ -44,7 +44,7 @@ if (!window.hemislamTour) {
     box.className = 'hs-tour hs';
     box.setAttribute('role', 'dialog');
     box.setAttribute('aria-label', 'Tour');
-    window.addEventListener('keydown', key); // not this image's own
+    window.addEventListener('keydown', key); // `window.`, or the listener would be this image's
     document.body.append(box);
     show();
   };

@@ -1,6 +1,6 @@
-// The bar at the scene's lower edge and the strips above it: draws them, reads the pointer, and tells the server what
-// was asked for (see viser_adapter.js).
-if (!this.isConnected) return; // a copy that the page has dropped already
+// The bar at the scene's lower edge and the strips above it: draws them, handles the pointer, and sends the user's
+// requests to the server (see viser_adapter.js).
+if (!this.isConnected) return; // a copy that the page has already removed
 const dock = this.parentElement, mover = dock.closest('[data-hs-to]'), home = mover.parentElement;
 const shell = dock.querySelector('.hs-tl'), canvas = shell.querySelector('canvas'), pen = canvas.getContext('2d');
 const bar = dock.querySelector('.hs-transport'), [play, fold, speed] = ['.hs-play', '.hs-fold', '.hs-speed'].map((c) => bar.querySelector(c));
@@ -44,9 +44,9 @@ const columnOf = (frame) => {
 const say = (text, x, y, colour, align = 'left') => {
   pen.fillStyle = colour; pen.textAlign = align; pen.fillText(text, x, y);
 };
-const cleared = (canvas, pen) => { // with as many pixels as the screen has; its width and height in those of CSS
+const cleared = (canvas, pen) => { // in device pixels; returns width and height in CSS pixels
   const ratio = window.devicePixelRatio || 1, W = canvas.clientWidth, H = canvas.clientHeight;
-  if (!W) return []; // hidden: it stays as it is
+  if (!W) return []; // hidden: leave it unchanged
   canvas.width = Math.round(W * ratio); canvas.height = Math.round(H * ratio);
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   return [W, H];
@@ -150,12 +150,12 @@ canvas.onpointerdown = (event) => {
 canvas.onpointerup = (event) => { if (scrubbing) { scrubbing = false; ask(frameAt(event), true); } };
 canvas.onpointerleave = () => { if (!scrubbing) { hover = null; draw(); } };
 // --- the bar
-const mark = () => { // above the track: loops, notes and where trouble begins
+const mark = () => { // above the track: loops, notes and beginnings of trouble
   const [W, H] = cleared(marks, ink), edge = 8;
   if (!W || !d) return;
   const X = (frame) => edge + (frame + 0.5) / d.frames * (W - 2 * edge);
   const bar = (frame, colour, high) => { ink.fillStyle = colour; ink.fillRect(X(frame) - 1.25, 0, 2.5, high); };
-  const lines = (colour, points, fill) => { // told apart by shape as well as by colour
+  const lines = (colour, points, fill) => { // distinguished by shape as well as by colour
     ink.beginPath();
     points.forEach(([x, y, move], i) => { if (i && !move) ink.lineTo(x, y); else ink.moveTo(x, y); });
     if (fill) { ink.fillStyle = colour; ink.fill(); } else { ink.strokeStyle = colour; ink.lineWidth = 1.5; ink.stroke(); }
@@ -186,7 +186,7 @@ const show = () => {
 };
 const dragged = (event) => { touched = performance.now(); ask(Number(slider.value), event.type === 'change'); };
 slider.oninput = slider.onchange = dragged;
-bar.onpointerup = () => document.activeElement.blur(); // so that keys act on the scene, without a ring
+bar.onpointerup = () => document.activeElement.blur(); // so that keys act on the scene, and no focus ring shows
 speed.addEventListener('click', (event) => { if (event.target.dataset.hs) speed.open = false; });
 window.addEventListener('pointerdown', (event) => { if (!speed.contains(event.target)) speed.open = false; });
 const unfold = (open) => {
@@ -200,7 +200,7 @@ const settle = () => {
   const scene = document.querySelector('canvas[data-engine]');
   if (!home.isConnected) { mover.remove(); return; }
   const other = window.hemislamDock !== mover && window.hemislamDock;
-  if (other && other.home.isConnected) mover.remove(); // viser has made the panel twice: the newest shows
+  if (other && other.home.isConnected) mover.remove(); // viser has made the panel twice: show the newest
   else if (scene) {
     window.hemislamDock = mover;
     const box = scene.getBoundingClientRect(), phone = innerWidth < 577;
@@ -227,7 +227,7 @@ const watch = (name, act) => {
 new MutationObserver(paint).observe(document.documentElement, {attributes: true});
 const copy = (name) => () => { dock.querySelector(name).innerHTML = document.querySelector(name + '-data').innerHTML; };
 watch('.hs-scale-data', copy('.hs-scale'));
-// The ends of the colour bar. While one is dragged the legend is not put in anew; a key keeps its focus.
+// The ends of the colour bar. The legend is not replaced while one is dragged; later, a focused end keeps its focus.
 const legend = dock.querySelector('.hs-legend'), ends = () => [...legend.querySelectorAll('input')];
 let spread = false;
 const explain = () => {
