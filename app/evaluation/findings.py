@@ -77,7 +77,7 @@ def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
         size = max(difference.size for _, difference in sure)
         found.append(Claim(f"{name} against {base} ({outcomes[name].meaning or 'as given'}): {words}.", size, own=True))
     if alike:
-        found.append(Claim(f"{', '.join(alike)}: no difference from {base} that may not be chance.", 0.0, own=True))
+        found.append(Claim(f"{', '.join(alike)}: no difference from {base} beyond chance.", 0.0, own=True))
     return found
 
 

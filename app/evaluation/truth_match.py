@@ -57,7 +57,7 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
                 " put their times, a line each, into a file times.txt beside it."
             )
         truth = replace(truth, stamps_ns=estimate.stamps_ns)
-        notes.append("It holds no times: one pose was assigned to each frame.")
+        notes.append("The truth holds no times: one pose was assigned to each frame.")
     stamps_ns = truth.stamps_ns
     assert stamps_ns is not None
     quaternions = truth.quaternions if truth.quaternions is not None else np.tile([0.0, 0.0, 0.0, 1.0], (len(truth), 1))
@@ -69,18 +69,20 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
         by_rotation = truth.quaternions is not None
         added_s, correlation = find_offset(estimate, there, by_rotation=by_rotation)
         notes.append(
-            f"Its clock is not the recording's: {added_s:+.3f} s were added, found by aligning the"
+            f"The truth has a clock of its own: {added_s:+.3f} s were added to its stamps, found by aligning the"
             f" {_speed(by_rotation)} of both (correlation {correlation:.3f})."
         )
     there = replace(there, stamps_ns=stamps_ns + round(added_s * 1e9))
     lever = np.array(truth.lever)
     if truth.quaternions is None:
         there = _borrow_rotation(there, estimate)
-        notes.append("It has no orientations: rotation errors cannot be measured.")
+        notes.append("The truth has no orientations: rotation errors cannot be measured.")
     if lever.any():
         there = replace(there, positions=there.positions - there.rotations.apply(lever))
-        axes = "its body's axes" if truth.quaternions is not None else "the IMU's axes"
-        notes.append(f"Its point lies {_vector(lever)} m from the IMU, in {axes}; this lever arm was subtracted.")
+        axes = "the axes of its body" if truth.quaternions is not None else "the IMU's axes"
+        notes.append(
+            f"The truth's point lies {_vector(lever)} m from the IMU, in {axes}; this lever arm was subtracted."
+        )
     has_rotation = truth.quaternions is not None
     if has_rotation:
         there, has_rotation, note = _common_axes(there, estimate, certainly=truth.own_axes)
@@ -114,7 +116,7 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
     if aligned.doubt and not certainly:
         return there, True, ""
     if aligned.doubt:
-        why = "Its axes are not the IMU's, and this trajectory does not determine the rotation between them."
+        why = "The truth's axes are not the IMU's, and this trajectory does not determine the rotation between them."
         return _borrow_rotation(there, estimate), False, f"{why} {aligned.doubt}"
     R_truth_estimate = Rotation.from_matrix(aligned.T_truth_estimate[:3, :3])
     between = theirs.rotations.inv() * R_truth_estimate * estimate.rotations[usable]
@@ -123,13 +125,13 @@ def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) ->
     spread = float(np.degrees(np.median((R_body_imu.inv() * between).magnitude())))
     if certainly:
         note = (
-            f"Its axes are not the IMU's: the constant rotation between them ({angle:.1f}°) was estimated as the mean"
-            f" over the trajectory (spread {spread:.2f}°) and removed, so rotation errors do not contain it."
+            f"The truth's axes are not the IMU's: the constant rotation between them ({angle:.1f}°) was estimated as"
+            f" the mean over the trajectory (spread {spread:.2f}°) and removed, so rotation errors do not contain it."
         )
         return replace(there, quaternions=(there.rotations * R_body_imu).as_quat()), True, note
     note = (
-        f"Its orientations differ from ours by a constant {angle:.0f}°. Its axes may not be the IMU's; rotation"
-        " errors and RPE then mean little."
+        f"The truth's orientations differ from ours by a constant {angle:.0f}°. Its axes may not be the IMU's;"
+        " rotation errors and RPE then mean little."
     )
     return there, True, note if angle > ODD_AXES_DEG and spread < angle / 3 else ""
 

@@ -116,5 +116,5 @@ def test_every_variant_of_the_user_s_is_among_the_first_five() -> None:
     first = "\n".join(findings(walks(*paper, *own))[:5])
     assert "odd against Ours (as given): the mean error (ATE) rises by 20 %" in first
     assert "tight against Ours (as given): the mean CPU time per frame falls by 10 %" in first
-    assert "loose, wide: no difference from Ours that may not be chance." in first
+    assert "loose, wide: no difference from Ours beyond chance." in first
     assert "FAST-LIO" in first, "and the biggest of the others"
