@@ -1,8 +1,8 @@
 """Detection of points on moving objects: simulated walks among people, and the same walks without people.
 
 A point is on a person if it lies within 8 cm of a body at the time of its measurement, and still if no body was within
-25 cm. Points in between, most of them mixed pixels, do not count. Only points of keyframes within 20 m are used. Seed 3
-was not used during development of the method.
+25 cm. Points in between, most of them mixed pixels, do not count. Only keyframes are used, and only their points within
+20 m. Seed 3 was not looked at during development of the method.
 """
 
 import time

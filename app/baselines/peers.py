@@ -14,7 +14,7 @@ from app.slam.types import F64, I64, Measurement
 
 
 class _Icp:
-    """LiDAR-only odometry. Its poses start at the LiDAR; they are converted to IMU poses in a world with z up."""
+    """LiDAR-only odometry in the LiDAR's first frame; `step` returns poses of the IMU in a world with z up."""
 
     in_middle = False
     """Whether its poses refer to the middle of scans instead of their end."""

@@ -28,7 +28,7 @@ _ATE_M = {
     "outdoor_4": (30.22, 1.25, 2.20, 0.85, 2.67, 0.87),
 }
 _RPE_M = {"outdoor_3": (0.31, 0.25, 0.19, 0.18, 0.19, 0.18), "outdoor_4": (0.24, 0.32, 0.16, 0.03, 0.09, 0.03)}
-"""In the order of SYSTEMS. The paper gives errors only for the two sequences with GNSS."""
+"""Errors in the order of SYSTEMS. The paper gives errors only for the two sequences with GNSS."""
 _TABLES_1_AND_3 = {
     "indoor_1": (2266, 226.63, 218.39, 28.97, 35.81),
     "indoor_2": (1252, 125.29, 54.63, 27.33, 34.11),
@@ -51,7 +51,7 @@ SEQUENCES: dict[str, Sequence] = {
     )
     for name, (frames, duration_s, length_m, fast_lio, ours) in _TABLES_1_AND_3.items()
 }
-"""By the name of the simulated twin."""
+"""The paper's sequences, by the name of the simulated twin."""
 
 NOT_COMPARABLE = (
     "The paper ran LOAM, LIOM and FAST-LIO on real recordings, on an Intel i7-8565U. Ours are simulated twins with the"

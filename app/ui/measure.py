@@ -25,7 +25,7 @@ _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
 _WIDTH: Final = 0.01
 """Largest distance of a point from a click, as a share of the picture's height."""
 _COLOURS: Final = {False: (255, 205, 80), True: (150, 90, 0)}
-"""On a dark and on a light background."""
+"""Colours on a dark and on a light background."""
 _CHOSEN: Final = "● "
 """Marks the tool that takes clicks."""
 _SIZE_M: Final = 0.08

@@ -91,7 +91,7 @@ STRIPS: Final = (
     Strip("error", "error", "cm", 1, "#ff5c8d", 5.0, "Distance to the truth, aligned to the trajectory so far.",
           lambda s: 1e2 * s["error_m"]),
 )  # fmt: skip
-"""In the order shown; the row of loops comes last."""
+"""The strips in the order shown; the row of loops comes last."""
 
 _STAMP: Final = "stamp"
 _VALUES: Final[dict[str, Callable[[Series], F64]]] = {

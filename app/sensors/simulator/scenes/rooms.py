@@ -183,7 +183,7 @@ def flats(rng: np.random.Generator) -> SimulatedScene:
 
 
 def _bay(mesh: MeshBuilder, x: float, side: float, y: float) -> None:
-    """One bay: a wall with an open door, and behind it a room with a table, a chair and a box.
+    """A bay: a wall with an open door, and behind it a room with a table, a chair and a box.
 
     Args:
         x: of the wall. side: +1 if the room lies towards +x, else -1. y: where the bay begins.
