@@ -154,8 +154,8 @@ class Player:
         self._aim(session, frame, frame if frame < max(session.heading, session.frame) else None, stepping=True)
 
     def seek(self, session: Session, frame: int) -> None:
-        """Go to a frame as fast as possible, then continue as before. From the last frame, go on to the end, where
-        loops are searched once more. Raises HemislamError: the source is live.
+        """Go to a frame as fast as possible, then continue as before. If it is the last frame, continue to the end of
+        the recording, where loops are searched once more. Raises HemislamError: the source is live.
         """
         if not session.feed.repeatable:
             raise HemislamError(ONLY_ON)

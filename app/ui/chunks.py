@@ -143,7 +143,7 @@ class MapChunks:
             self.limits = limits
         ends = chosen_ends(self.limits, view.colour_by, view.ends)
         look: tuple[object, ...] = (view.colour_by, view.numbers, ends.get(view.colour_by), ends.get(INTENSITY))
-        if view.tuning:  # the map stands back, in one colour
+        if view.tuning:  # the map is dimmed, in one colour
             look = (view.light,)
         recolour, self._look = look != self._look, look
         seen, self._view = self._view, view

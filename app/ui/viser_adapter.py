@@ -10,7 +10,7 @@ viser has no events for HTML and no way to run a script, and it has keys of its 
 * A button has the class `mantine-Button-root`, and `gray-filled` in its style if it is gray; a text field has the class
   `mantine-TextInput-input`.
 * A number box is an `<input class="mantine-NumberInput-input">` whose `input` events viser sends; that of a slider
-  stands beside its track.
+  is beside its track.
 * Tooltips have the class `mantine-Tooltip-tooltip`, and the scene is a `<canvas data-engine>`.
 * A phone's panel has its largest height and its width in its style; a folder is a Paper with a border.
 * While the server is not connected, panels are dimmed with a transition of 150 ms and take no clicks.

@@ -83,7 +83,7 @@ def describe_edit(command: LoopEdit) -> str:
         case SetWeight(weight=weight):
             return f"weigh {pair} by {weight:g}"
         case Add(register=register):
-            return f"add {pair}" + ("" if register else " as it lies")
+            return f"add {pair}" + ("" if register else " without registration")
         case _:
             return f"reject {pair}"
 
