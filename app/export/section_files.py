@@ -45,9 +45,7 @@ def write_png(path: Path, results: Results, section: Slab) -> None:
         draw.text((left - 8, y), f"{at:g}", _TEXT, font, anchor="rm")
     draw.text((left, top - 12), _title(results), _TEXT, font, anchor="ls")
     draw.text((left, top + rows + 32), _caption(results), _TEXT, font, anchor="lt")
-    black = max(
-        4.0, float(np.percentile(section.points[section.points > 0], 90))
-    )  # this many points in a cell are black
+    black = max(4.0, float(np.percentile(section.points[section.points > 0], 90)))  # points in a black cell
     share = np.where(section.points > 0, 90 + 165 * np.minimum(section.points / black, 1.0), 0.0)
     is_ground = 2 * section.ground > section.points
     for colour, which in ((OTHER, ~is_ground), (GROUND, is_ground)):
