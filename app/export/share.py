@@ -107,9 +107,7 @@ def _colours(heights: F32) -> U8:
     if not len(heights):
         return np.empty((0, 3), np.uint8)
     low, high = np.percentile(heights, [2, 98])
-    share = (
-        np.round(np.clip((heights - low) / max(high - low, 1e-6), 0, 1) * 63) / 63
-    )  # few colours keep the file small
+    share = np.round(np.clip((heights - low) / max(high - low, 1e-6), 0, 1) * 63) / 63  # few colours make small files
     return np.stack([np.interp(share, np.linspace(0, 1, len(STOPS)), stop) for stop in STOPS.T], axis=1).astype(
         np.uint8
     )
