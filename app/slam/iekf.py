@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.slam.imu import DIM, POS, ROT, Belief
+from app.slam.imu import DIM, POS, POSE, ROT, Belief
 from app.slam.kernels import manifold
 from app.slam.kernels import registration as kernels
 from app.slam.local_map import LocalMap, Planes
@@ -27,7 +27,8 @@ MIN_INLIERS = 30
 """Least number of planes for an update; with fewer the prediction stands."""
 OPEN_SIGMA = 0.03
 """m (rotation: as below): if good planes leave a direction less certain than this, poor ones are used too, weighted by
-their certainty. In a park all good planes lie on the ground, and only trunks constrain the position along it."""
+their certainty. In a park all good planes lie on the ground, and only trunks constrain the position along it. A few
+points could then decide about that direction, so the weight of each is limited (`LARGEST_SHARE`)."""
 MANY_PLANES = 0.45
 """If at least this share of a scan's points has a plane, the scan is trusted where it contradicts the IMU."""
 SURPRISING = 4.0
@@ -37,6 +38,8 @@ DEGENERATE_SIGMA = 0.1
 """m (rotation: rad times the RMS range of the points): a direction that one scan alone leaves more
 uncertain than this is degenerate."""
 
+NO_LIMIT = np.zeros((6, 6))
+"""In place of the posterior by which the weights of points are limited."""
 NAVIGATION = 17
 """Error dimensions without the extrinsics, which come last and are fixed unless estimated."""
 
@@ -81,17 +84,17 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
     free = DIM if params.estimate_extrinsics else NAVIGATION
     information = np.asarray(np.linalg.inv(prior.covariance[:free, :free]))
     world, residuals = np.empty((n, 3)), np.empty(n)
-    H, b, stats = np.empty((6, 6)), np.empty(6), np.zeros(2)
+    H, raw, b, stats = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.zeros(2)
     begin = x = _packed(prior.state)
     covariance, step = np.empty((free, free)), np.empty(DIM)
     planes: Planes | None = None
     since_search = np.zeros(DIM)
     converged, iteration, sure = False, 0, True
 
-    def accumulate(planes: Planes) -> None:
+    def accumulate(planes: Planes, posterior: F64 = NO_LIMIT) -> None:
         kernels.normal_equations(
             points, R, p, R_il, p_il, planes.normals, planes.centers, planes.variances,
-            planes.deviations, params.gate, H, b, stats, residuals,
+            planes.deviations, params.gate, posterior, raw, H, b, stats, residuals,
         )  # fmt: skip
 
     for iteration in range(1, params.max_iterations + 1):
@@ -107,6 +110,8 @@ def update(prior: Belief, points: F32, local_map: LocalMap, params: FilterParams
             since_search[:] = 0.0
         else:
             accumulate(planes)
+        if not sure:
+            accumulate(planes, _pose_covariance(prior, raw))
         if stats[0] < MIN_INLIERS:
             return prior, too_few(iteration, n, int(stats[0]), matches(points, residuals, planes))
         H, b = _nonnegative(H, b)
@@ -161,6 +166,12 @@ def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
     told = axes[:, eigenvalues > 0.0]
     kept = told @ told.T
     return kept @ H @ kept, kept @ b
+
+
+def _pose_covariance(prior: Belief, H: F64) -> F64:
+    """The covariance (6, 6) of the prior's pose after information H (6, 6), which is not negative, is added to it."""
+    before = prior.covariance[POSE, POSE]
+    return np.asarray(np.linalg.solve(np.eye(6) + before @ H, before))
 
 
 def too_few(iterations: int, used: int, inliers: int, matches: Matches) -> Registration:

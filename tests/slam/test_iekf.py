@@ -125,12 +125,12 @@ def test_a_plain_corridor_holds_everything_but_the_way_along_it() -> None:
     assert np.sqrt(posterior.covariance[4, 4]) < 0.01
 
 
-def rough_corridor(rng: np.random.Generator, points: int, length: float) -> np.ndarray:
-    """(points, 3) m, of four walls along x that nothing interrupts, with a noise of 2 cm."""
+def rough_corridor(rng: np.random.Generator, points: int, length: float, noise: float = 0.02) -> np.ndarray:
+    """(points, 3) m, of four walls along x that nothing interrupts, with a noise in m."""
     along, across = rng.uniform((-length, -1.0), (length, 1.0), (points, 2)).T
     wall = rng.choice((-1.2, 1.2), points)
     sides = np.stack([np.column_stack([along, wall, across]), np.column_stack([along, across, wall])])
-    return sides[rng.integers(0, 2, points), np.arange(points)] + rng.normal(scale=0.02, size=(points, 3))
+    return sides[rng.integers(0, 2, points), np.arange(points)] + rng.normal(scale=noise, size=(points, 3))
 
 
 def test_the_roughness_of_a_corridor_does_not_tell_the_way_along_it() -> None:
@@ -148,6 +148,26 @@ def test_the_roughness_of_a_corridor_does_not_tell_the_way_along_it() -> None:
     along, across, up = np.sqrt(np.diag(belief.covariance)[POS])
     assert along > 0.2
     assert max(across, up) < 0.005
+
+
+@pytest.mark.parametrize(("points", "least", "most"), [(2, -0.01, 0.02), (20, 0.08, 0.11)], ids=["two", "twenty"])
+def test_two_points_do_not_tell_the_way_along_a_corridor(points: int, least: float, most: float) -> None:
+    """A panel across the corridor now stands 10 cm closer. Twenty points on it are believed, two are not."""
+    local_map, rng = LocalMap(MapParams()), np.random.default_rng(1)
+
+    def seen(walls: int, panel: int, at: float) -> np.ndarray:
+        across = np.column_stack([np.full(panel, at), rng.uniform(-0.3, 0.3, (panel, 2))])
+        across[:, 0] += rng.normal(scale=0.01, size=panel)
+        return np.concatenate([rough_corridor(rng, walls, 6.0, 0.01), across]).astype(np.float32)
+
+    for _ in range(6):
+        local_map.insert(seen(700, 60, 3.0), np.zeros(3), MapParams())
+    level = replace(
+        truth(NEAR), R_odom_imu=np.eye(3), R_imu_lidar=np.eye(3), p_odom_imu=np.zeros(3), p_imu_lidar=np.zeros(3)
+    )
+    scan, params = seen(600, points, 2.9), FilterParams(gate=0.3)
+    posterior, _ = iekf.update(Belief(level, uncertain(0.01, 0.05)), scan, local_map, params)
+    assert least < posterior.state.p_odom_imu[0] < most
 
 
 def test_a_corridors_end_in_sight_ends_the_degeneracy() -> None:

@@ -14,6 +14,9 @@ that the line sweeps. That looks like a surface seen edge-on, and it turns with 
 RESIDUAL_HUBER = 2.0
 """Standard deviations beyond which a residual has constant influence (Huber 1964). Otherwise, one of 400 points on a
 wrong plane could move the pose by millimetres."""
+LARGEST_SHARE = 0.1
+"""Largest share of the information about a direction, the prior's included, that one point may give. Otherwise one
+wrong plane could decide about a direction of which nothing else tells (bounded influence, Krasker & Welsch 1982)."""
 
 
 @njit(cache=True)
@@ -48,8 +51,20 @@ def _add(w, d, row, H, b):
             H[i, k] += wi * row[k]
 
 
+@njit(cache=True, inline="always")
+def _quadratic(A, row):
+    """row^T A row, for A (6, 6) and row (6,)."""
+    total = 0.0
+    for i in range(6):
+        for k in range(6):
+            total += row[i] * A[i, k] * row[k]
+    return total
+
+
 @njit(cache=True)
-def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, deviations, gate, H, b, stats, residuals):
+def normal_equations(
+    points, R, p, R_il, p_il, normals, centers, variances, deviations, gate, posterior, raw, H, b, stats, residuals
+):  # fmt: skip
     """Accumulate H^T W H and H^T W z of eq. 5-6 over all points with a plane.
 
     A normal has errors of its own. Their squares would count as information, mostly along a corridor, where there is
@@ -58,10 +73,12 @@ def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, devi
 
     Columns: rotation (right perturbation) and position. points (n, 3) f32 m, LiDAR frame; R, p: pose of the IMU in
     odom; R_il, p_il: pose of the LiDAR in the IMU frame; normals, centers (n, 3), variances (n,) m², deviations
-    (n, 2, 3) rad: planes as from `kernels.map.planes`; gate m/√m. Out: H (6, 6), b (6,), stats (2,): inliers and their
-    sum of squared distances in m²; residuals (n,) m, signed, nan if not used.
+    (n, 2, 3) rad: planes as from `kernels.map.planes`; gate m/√m; posterior (6, 6): covariance of the pose once all
+    points have full weight, by which LARGEST_SHARE limits the weight of each, or zeros for no limit. Out: raw (6, 6):
+    H before the subtraction; H (6, 6), b (6,), stats (2,): inliers and their sum of squared distances in m²;
+    residuals (n,) m, signed, nan if not used.
     """
-    H[:], b[:], stats[:] = 0.0, 0.0, 0.0
+    raw[:], H[:], b[:], stats[:] = 0.0, 0.0, 0.0, 0.0
     row = np.empty(6)
     for j in range(len(points)):
         residuals[j] = np.nan
@@ -86,14 +103,19 @@ def normal_equations(points, R, p, R_il, p_il, normals, centers, variances, devi
         w = 1.0 / (REPEATED * variances[j])
         if d * d > RESIDUAL_HUBER * RESIDUAL_HUBER * variances[j]:
             w *= RESIDUAL_HUBER * math.sqrt(variances[j]) / abs(d)
+        uncertainty = _quadratic(posterior, row)
+        if w * uncertainty > LARGEST_SHARE:
+            w = LARGEST_SHARE / uncertainty
         residuals[j] = d
         stats[0] += 1.0
         stats[1] += d * d
-        _add(w, d, row, H, b)
+        _add(w, d, row, raw, b)
         for m in range(2):
             nx, ny, nz = deviations[j, m, 0], deviations[j, m, 1], deviations[j, m, 2]
             _differentiate(nx, ny, nz, R, ix, iy, iz, row)
             _add(-w, nx * ox + ny * oy + nz * oz, row, H, b)
     for i in range(6):
-        for k in range(i):
-            H[i, k] = H[k, i]
+        for k in range(i, 6):
+            raw[k, i] = raw[i, k]
+            H[i, k] += raw[i, k]
+            H[k, i] = H[i, k]
