@@ -39,7 +39,7 @@ DEGENERATE_SIGMA = 0.1
 uncertain than this is degenerate."""
 
 NO_LIMIT = np.zeros((6, 6))
-"""In place of the posterior by which the weights of points are limited."""
+"""Passed as the posterior covariance where the weights of points are not limited."""
 NAVIGATION = 17
 """Error dimensions without the extrinsics, which come last and are fixed unless estimated."""
 
@@ -169,7 +169,7 @@ def _nonnegative(H: F64, b: F64) -> tuple[F64, F64]:
 
 
 def _pose_covariance(prior: Belief, H: F64) -> F64:
-    """The covariance (6, 6) of the prior's pose after information H (6, 6), which is not negative, is added to it."""
+    """The covariance (6, 6) of the prior's pose once the positive semidefinite information H (6, 6) is added."""
     before = prior.covariance[POSE, POSE]
     return np.asarray(np.linalg.solve(np.eye(6) + before @ H, before))
 

@@ -15,8 +15,8 @@ RESIDUAL_HUBER = 2.0
 """Standard deviations beyond which a residual has constant influence (Huber 1964). Otherwise, one of 400 points on a
 wrong plane could move the pose by millimetres."""
 LARGEST_SHARE = 0.1
-"""Largest share of the information about a direction, the prior's included, that one point may give. Otherwise one
-wrong plane could decide about a direction of which nothing else tells (bounded influence, Krasker & Welsch 1982)."""
+"""About the largest share of the information on a direction, the prior's included, that one point may give: one wrong
+plane must not decide about a direction that nothing else constrains (bounded influence, Krasker & Welsch 1982)."""
 
 
 @njit(cache=True)
