@@ -13,6 +13,8 @@ from tests.browser.conftest import Bench
 
 @pytest.fixture(autouse=True)
 def _fresh(bench: Bench) -> None:
+    """Words of the test before may still wait: they are sent once nothing has changed in the page for 60 ms."""
+    bench.page.evaluate("new Promise((done) => setTimeout(done, 500))")
     bench.engine.sent.clear()
 
 
