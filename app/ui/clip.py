@@ -19,7 +19,7 @@ from app.ui.camera import OBLIQUE, CameraPanel
 from app.ui.clip_maths import FACES, along_line, carried, edges, handle, pulled
 from app.ui.geometry import wxyz
 from app.ui.html import panel
-from app.ui.measure import MeasurePanel
+from app.ui.measure import DISTANCE, MeasurePanel
 from app.ui.nodes import add_lines
 from app.ui.widgets import ROOT, Changes, Page, View, add_button, as_set, by_user, limited, notify_error, show
 
@@ -53,10 +53,8 @@ class ClipPanel:
         self._shown: Clip | None = None  # what the widgets were last set to
         self._dragged: Box | None = None  # the box as set by a handle, until the session stores it
         self._held: int | None = None  # the browser that holds a handle
-        self._session = -1
         self._lines: viser.LineSegmentsHandle | None = None
         self._handles: dict[int, viser.TransformControlsHandle] = {}
-        self._first: Spot | None = None
         self._on = gui.add_checkbox("clip box", False, hint="Hide what is outside. Exports can be limited to it.")
         self._fields = gui.add_folder(None, visible=False)
         with self._fields:
@@ -108,11 +106,8 @@ class ClipPanel:
         if clip != self._shown:
             self._shown, self._dragged = clip, None
             self._show(clip)
-        if current.session != self._session or not self._measure.picking:
-            self._session, self._first = current.session, None
-        cutting = self._measure.taker == self._picked
-        self._asked.visible = cutting
-        self._asked.content = panel("note", f"Click the {'first' if self._first is None else 'other'} end on the map.")
+        self._asked.visible = self._measure.taker == self._picked
+        self._asked.content = panel("note", f"Click the {'other' if self._measure.spots else 'first'} end on the map.")
         box = None if clip.unrolled else clip.hiding
         if self._scene_changes(box, self._dragged, self._held, self._pull.value):
             self._draw_scene(box)
@@ -177,17 +172,11 @@ class ClipPanel:
 
     # --- a section by two clicks -----------------------------------------------------------------
     def _begin_cut(self, client: viser.ClientHandle) -> None:
-        self._first, self._client = None, client
-        self._measure.pick(self._picked)
+        self._client = client
+        self._measure.begin(DISTANCE, self._picked)
 
-    def _picked(self, spot: Spot, current: Snapshot) -> None:
-        if self._first is None:
-            self._measure.pick(self._picked)
-            self._first = spot
-            return
-        poses = current.keyframe_poses
-        first, second = (lie.moved(poses[one.keyframe], one.at) for one in (self._first, spot))
-        self._first = None
+    def _picked(self, spots: tuple[Spot, ...], current: Snapshot) -> None:
+        first, second = (lie.moved(current.keyframe_poses[spot.keyframe], spot.at) for spot in spots)
         whole = self._whole()
         box = along_line(first, second, current.clip.slab, whole.low[2], whole.high[2])
         if box is None:

@@ -20,7 +20,7 @@ from app.ui.files import FileList
 from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit
-from app.ui.measure import MeasurePanel
+from app.ui.measure import POINT, MeasurePanel
 from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, limited, show
@@ -80,7 +80,9 @@ class GeoreferencePanel:
         self._name = gui.add_dropdown("control point", ("–",))
         self._fit = gui.add_dropdown("pick", (_POINT, _SPHERE), hint="By a click on the map.")
         self._radius = limited(gui.add_number("sphere's radius (m)", 0.0725, min=0.01, max=1.0, step=0.0005))
-        self._pick = add_button(gui, _PICK, lambda _: measure.pick(self._picked), viser.Icon.MAP_PIN, color=None)
+        self._pick = add_button(
+            gui, _PICK, lambda _: measure.begin(POINT, self._picked), viser.Icon.MAP_PIN, color=None
+        )
         self._bridge = Bridge(gui, "georeference", self._act)
         self._html = gui.add_html("")
         self._by.on_update(by_user(lambda _, __: self._show_widgets()))
@@ -159,9 +161,10 @@ class GeoreferencePanel:
             self._name.options = names
 
     # --- picking ---------------------------------------------------------------------------------
-    def _picked(self, spot: Spot, current: Snapshot) -> None:
+    def _picked(self, spots: tuple[Spot, ...], current: Snapshot) -> None:
         """Assign the clicked point, or the centre of the sphere there, to the chosen control point."""
-        poses, at, name = current.keyframe_poses, spot.at, self._name.value
+        (spot,), poses, name = spots, current.keyframe_poses, self._name.value
+        at = spot.at
         try:
             if self._fit.value == _SPHERE:
                 at = centre_of_sphere(current.chunks, poses, spot, self._radius.value)

@@ -20,7 +20,7 @@ from app.ui.nodes import add_exact_points, add_lines, clear, label_text, segment
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, View, add_button, ask_text, by_user, show
 
-POINT, DISTANCE, ANGLE, STOP, PICK = "point", "distance", "angle", "stop", "pick"
+POINT, DISTANCE, ANGLE, STOP = "point", "distance", "angle", "stop"
 _SPOTS: Final = {POINT: 1, DISTANCE: 2, ANGLE: 3}
 _WIDTH: Final = 0.01
 """Largest distance of a point from a click, as a share of the picture's height."""
@@ -30,19 +30,25 @@ _CHOSEN: Final = "● "
 """Marks the tool that takes clicks."""
 _SIZE_M: Final = 0.08
 
+Taker = Callable[[tuple[Spot, ...], Snapshot], None]
+
 
 class MeasurePanel:
-    """Widgets in the caller's container, and the measures in the scene, below the map's node."""
+    """Widgets in the caller's container, and the measures in the scene, below the map's node.
+
+    Attributes:
+        spots: clicked so far, of the unfinished measure. taker: the panel that gets them in place of a measure.
+    """
 
     def __init__(self, page: Page) -> None:
         gui = page.gui
         self._page = page
         self._changes = Changes()
         self._kind = STOP
-        self.taker: Callable[[Spot, Snapshot], None] | None = None  # takes the next spot instead of a measure
+        self.taker: Taker | None = None
         self._where: GeoReference | None = None
         self._click: tuple[F64, F64, float] | None = None  # newest click: its ray in the map, and its angular radius
-        self._spots: tuple[Spot, ...] = ()  # of the unfinished measure
+        self.spots: tuple[Spot, ...] = ()
         self._session = -1  # session of these spots
         self._nodes: list[Any] = []
         self._measured: list[tuple[Measure, F64, Numbers]] = []
@@ -66,36 +72,32 @@ class MeasurePanel:
         """Whether this panel takes clicks in the scene."""
         return self._kind != STOP
 
-    def begin(self, kind: str, taker: Callable[[Spot, Snapshot], None] | None = None) -> None:
+    def begin(self, kind: str, taker: Taker | None = None) -> None:
+        """Take clicks for measures of this kind. taker: gets the spots of the first one, which then is the last."""
         load()
-        self.taker = taker
-        self._kind, self._spots = kind, ()
-
-    def pick(self, taker: Callable[[Spot, Snapshot], None]) -> None:
-        """Give `taker` the spot of the next click, instead of measuring it."""
-        self.begin(PICK, taker)
+        self._kind, self.taker, self.spots = kind, taker, ()
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Handle the newest click, and show the session's measures."""
         if current.session != self._session:  # the spots belong to another session
-            self._session, self._spots = current.session, ()
+            self._session, self.spots = current.session, ()
         click, self._click = self._click, None
         poses = current.keyframe_poses
-        kind = self._kind
-        if click is not None and kind != STOP and view.map:
+        tool = self._kind, self.taker
+        if click is not None and self.picking and view.map:
             spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, moving=view.moving, clip=view.clip)
             if spot is not None and self._snap.value:
                 spot = snapped(current.chunks, poses, spot)
-            if spot is not None and self._kind == kind:  # meanwhile the user may have chosen another
-                self._take(kind, spot, current)
-        frames = {chunk.index: chunk.frame for chunk in current.chunks} if current.measures or self._spots else {}
+            if spot is not None and tool == (self._kind, self.taker):  # meanwhile the user may have chosen another
+                self._take(self._kind, spot, current)
+        begun = self.spots if self.taker is None else ()
+        frames = {chunk.index: chunk.frame for chunk in current.chunks} if current.measures or begun else {}
         kept = [(measure, places(measure, poses, frames)) for measure in current.measures]
-        begun = places(Measure("", self._spots), poses, frames) if self._spots else None
         where = [(measure, at) for measure, at in kept if at is not None]
         drawn = str([at.round(3).tolist() for _, at in where])
         self._where = current.earth.found.reference if current.earth.found is not None else None
         later = len(kept) - len(where)
-        due = current.measures, self._kind, str(self._spots), drawn, later, current.session, self._where
+        due = current.measures, self._kind, self.taker, str(begun), drawn, later, current.session, self._where
         if self._changes(*due, view.light, view.map):
             self._light = view.light
             map_ = current.chunks, current.keyframe_poses
@@ -105,24 +107,23 @@ class MeasurePanel:
             self._measured = [
                 (measure, at, known.get(measure) or numbers(at, current.chunks, poses)) for measure, at in where
             ]
-            self._draw_scene(begun)
+            self._draw_scene(places(Measure("", begun), poses, frames) if begun else None)
             self._draw_list(later, view.map)
 
     def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
-        if kind == PICK:
-            taker = self.taker
-            self.begin(STOP)
-            if taker is not None:
-                taker(spot, current)
+        self.spots = (*self.spots, spot)
+        if len(self.spots) < _SPOTS[kind]:
             return
-        self._spots = (*self._spots, spot)
-        if len(self._spots) == _SPOTS[kind]:
-            taken = {measure.name for measure in current.measures}
-            numbered = (f"{kind} {number}" for number in itertools.count(1))
-            name = self._name.value.strip() or next(name for name in numbered if name not in taken)
-            self._page.send(KeepMeasure(Measure(name, self._spots)))
-            self._spots = ()
-            show(self._name, "")
+        spots, self.spots = self.spots, ()
+        if (taker := self.taker) is not None:
+            self.begin(STOP)
+            taker(spots, current)
+            return
+        taken = {measure.name for measure in current.measures}
+        numbered = (f"{kind} {number}" for number in itertools.count(1))
+        name = self._name.value.strip() or next(name for name in numbered if name not in taken)
+        self._page.send(KeepMeasure(Measure(name, spots)))
+        show(self._name, "")
 
     def _draw_scene(self, begun: F64 | None) -> None:
         clear(self._nodes)
@@ -142,12 +143,13 @@ class MeasurePanel:
 
     def _draw_list(self, later: int, map_shown: bool) -> None:
         """later: number of measures on keyframes that do not exist now, for example after going back."""
-        left = _SPOTS.get(self._kind, 0) - len(self._spots)
+        own = self._kind if self.taker is None else STOP
+        left = _SPOTS[own] - len(self.spots) if own != STOP else 0
         self._kinds.options = (
-            *(_CHOSEN + kind if kind == self._kind else kind for kind in _SPOTS),
+            *(_CHOSEN + kind if kind == own else kind for kind in _SPOTS),
             *([STOP] if self.picking else []),
         )
-        points = f"{left}{' more' if self._spots else ''} point{'s' if left > 1 else ''}"
+        points = f"{left}{' more' if self.spots else ''} point{'s' if left > 1 else ''}"
         asked = f"{self._kind.capitalize()}: click {points} of the map." if left else ""
         if self.picking and not map_shown:
             asked = "The map is hidden; show it to click on points."

@@ -258,10 +258,7 @@ def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.V
     bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
     assert bench.measure.picking
     for keyframe in (0, 2):
-        taker = bench.measure.taker
-        assert taker is not None
-        bench.measure.begin("stop")  # as the measures do with a click that they give away
-        taker(Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
+        bench.measure._take(bench.measure._kind, Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
     box = bench.now.clip.hiding
     assert box is not None
     np.testing.assert_allclose(box.middle[:2], [10.0, 0.0], atol=1e-9)
@@ -271,15 +268,16 @@ def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.V
 
 def test_a_cut_that_is_begun_is_not_ended_in_another_recording(server: viser.ViserServer) -> None:
     bench = Bench(server)
-    bench.draw()
+    bench.measure.draw(bench.now, View())
     bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
-    bench.panel._picked(Spot(0, (0.0, 0.0, 0.0)), bench.now)
+    bench.measure._take(bench.measure._kind, Spot(0, (0.0, 0.0, 0.0)), bench.now)
     bench.draw()
     assert "other end" in bench.panel._asked.content
     bench.now = replace(bench.now, session=bench.now.session + 1)
+    bench.measure.draw(bench.now, View())
     bench.draw()
     assert "first end" in bench.panel._asked.content
-    bench.panel._picked(Spot(2, (0.0, 0.0, 0.0)), bench.now)
+    bench.measure._take(bench.measure._kind, Spot(2, (0.0, 0.0, 0.0)), bench.now)
     assert bench.now.clip.box is None and bench.measure.picking
 
 

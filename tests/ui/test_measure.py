@@ -165,7 +165,7 @@ def test_a_click_beside_the_map_is_not_taken_and_stop_ends_it(server: viser.Vise
 
 def test_while_the_map_is_hidden_the_panel_says_why_no_click_counts(server: viser.ViserServer) -> None:
     bench = Bench(server)
-    for begin in (lambda: bench.panel.begin(POINT), lambda: bench.panel.pick(lambda *_: None)):
+    for begin in (lambda: bench.panel.begin(POINT), lambda: bench.panel.begin(POINT, lambda *_: None)):
         begin()
         bench.panel.draw(bench.now, View(map=False))
         assert bench.panel._asked.visible and "The map is hidden" in bench.panel._asked.content
@@ -246,7 +246,7 @@ def test_a_click_that_is_met_while_stop_is_pressed_is_dropped(
     monkeypatch.setattr("app.ui.measure.meet", meet_slowly)
     bench.panel.begin(POINT)
     bench.click(0.0, 0.0)
-    assert not bench.sent and not bench.panel._spots
+    assert not bench.sent and not bench.panel.spots
 
 
 def test_a_number_that_a_deleted_measure_had_is_free_again_and_no_other(server: viser.ViserServer) -> None:
