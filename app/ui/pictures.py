@@ -6,7 +6,6 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +19,7 @@ from app.ui.colours import Key
 from app.ui.files import result_folder_name, size_text
 from app.ui.html import panel
 from app.ui.picture_maths import Station, composed, flight
-from app.ui.widgets import Changes, Page, add_button, limited, notify_error, show
+from app.ui.widgets import Changes, Page, add_button, limited, show
 
 _LARGEST: Final = 8192
 _MOST_PIXELS: Final = 6144 * 4096
@@ -43,29 +42,27 @@ class PicturesPanel:
     def __init__(self, page: Page, results: Path, key: Callable[[], tuple[Key, bool]]) -> None:
         gui = page.gui
         self._page, self._results, self._key = page, results, key
-        self._flying: threading.Thread | None = None
+        self._flying = threading.Lock()  # held by the thread of the button that began the flight
         self._stopped = threading.Event()
         self._share, self._saved = 0.0, Path()
         self._changes = Changes()
         self._width = limited(gui.add_number("width (px)", 1920, min=64, max=_LARGEST, step=1))
         self._height = limited(gui.add_number("height (px)", 1080, min=64, max=_LARGEST, step=1))
         self._explain = gui.add_checkbox("with legend and scale", True)
-        shoot = partial(self._reporting, act=self._shoot)
-        add_button(gui, "Take a picture", shoot, viser.Icon.CAMERA, hint="A PNG of this view.")
+        add_button(gui, "Take a picture", self._shoot, viser.Icon.CAMERA, hint="A PNG of this view.")
         self._way = gui.add_dropdown("fly with", tuple(_WAYS))
         self._seconds = limited(
             gui.add_number("length (s)", 20.0, min=1.0, max=600.0, step=1.0, hint=f"{_RATE} pictures per second.")
         )
         hint = "Numbered PNGs of this size, in a zip file. Keep this browser tab in front."
-        fly = partial(self._reporting, act=self._fly)
-        self._start = add_button(gui, "Fly along the path", fly, viser.Icon.MOVIE, hint=hint)
+        self._start = add_button(gui, "Fly along the path", self._fly, viser.Icon.MOVIE, hint=hint)
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._stop = add_button(gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False)
         self._where = gui.add_html("", visible=False)
         self._download = add_button(gui, "Download the flight", self._send, viser.Icon.DOWNLOAD, visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
-        flying = self._flying is not None and self._flying.is_alive()
+        flying = self._flying.locked()
         self._start.disabled = flying or len(snapshot.trajectory) < 2
         if self._changes(flying, int(100 * self._share), str(self._saved)):
             self._progress.visible = self._stop.visible = flying
@@ -130,18 +127,17 @@ class PicturesPanel:
     # --- a flight --------------------------------------------------------------------------------
     def _fly(self, client: viser.ClientHandle) -> None:
         path = self._page.snapshot().trajectory
-        if len(path) < 2 or (self._flying is not None and self._flying.is_alive()):
+        if len(path) < 2 or not self._flying.acquire(blocking=False):
             return
-        self._size()
-        stations = flight(path, round(_RATE * self._seconds.value), *_WAYS[self._way.value])
-        file = self._results / "flights" / f"{self._name()}.zip"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        self._share = 0.0
-        self._stopped.clear()
-        self._flying = threading.Thread(
-            target=self._reporting, args=(client, lambda client: self._take(client, stations, file)), daemon=True
-        )
-        self._flying.start()
+        try:
+            stations = flight(path, round(_RATE * self._seconds.value), *_WAYS[self._way.value])
+            file = self._results / "flights" / f"{self._name()}.zip"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self._share = 0.0
+            self._stopped.clear()
+            self._take(client, stations, file)
+        finally:
+            self._flying.release()
 
     def _take(self, client: viser.ClientHandle, stations: list[Station], file: Path) -> None:
         """Write the pictures one after another. If stopped, leave no file."""
@@ -167,14 +163,3 @@ class PicturesPanel:
         if size > _MOST_SENT:
             raise HemislamError(f"{size_text(size)} is too large to download; the file is {self._saved}.")
         client.send_file_download(self._saved.name, self._saved.read_bytes(), save_immediately=True)
-
-    def _reporting(self, client: viser.ClientHandle, act: Callable[[viser.ClientHandle], None]) -> None:
-        problem = ""
-        try:
-            act(client)
-        except HemislamError as error:
-            problem = str(error)
-        except OSError as error:
-            problem = f"The pictures cannot be written: {error.strerror or error}."
-        if problem and client.client_id in self._page.server.get_clients():
-            notify_error(client, problem)

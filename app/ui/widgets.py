@@ -115,7 +115,7 @@ class Page:
 
 Callback = Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]
 _THREADS: Final = ThreadPoolExecutor(32, "page")
-"""Threads that run callbacks, as many as viser has. Some wait minutes for a picture."""
+"""Threads that run callbacks, as many as viser has. Some wait minutes for pictures."""
 _NumberBox = TypeVar("_NumberBox", bound=viser.GuiNumberHandle[Any] | viser.GuiVector3Handle)
 _PLAIN: Final = (str, int, float, Enum, frozenset, View, Limits)
 

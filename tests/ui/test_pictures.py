@@ -19,7 +19,8 @@ from app.ui.camera import FOV
 from app.ui.colours import HEIGHT, LOOK, Key, Limits, key
 from app.ui.picture_maths import BACKGROUND, composed, flight, looking
 from app.ui.pictures import PicturesPanel
-from tests.ui.conftest import page_of
+from app.ui.widgets import by_user
+from tests.ui.conftest import finish, page_of
 
 CORNER = np.array([[0.0, 0.0, 1.5], [20.0, 0.0, 1.5], [20.0, 10.0, 1.5]])
 
@@ -128,9 +129,8 @@ class Bench:
         self.panel.draw(WALKED)
 
     def do(self, act: Any) -> None:
-        self.panel._reporting(self.browser, act)  # type: ignore[arg-type]
-        if self.panel._flying is not None:
-            self.panel._flying.join(60)
+        button = SimpleNamespace(client=self.browser, target=SimpleNamespace(value=True))
+        finish(by_user(lambda _, client: act(client))(button))  # type: ignore[arg-type]
         self.panel.draw(WALKED)
 
 
