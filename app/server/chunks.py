@@ -97,7 +97,7 @@ def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
     T = lie.inverse(T_map_after) @ T_map_lidar
     moved = replace(chunk, points=lie.moved(T, chunk.points).astype(np.float32))
     both: dict[str, Any] = {name: np.concatenate((getattr(moved, name), getattr(after, name))) for name in _BY_POINT}
-    joined = replace(after, joined=chunk.joined + after.joined + 1, **both)
+    joined = replace(after, **both)
     order = np.random.default_rng(after.index).permutation(len(joined.points))
     joined = _chosen(joined, order, after.level)
     return _at_level(joined, after.level) if after.level else joined

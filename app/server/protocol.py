@@ -178,7 +178,7 @@ class Chunk:
     Attributes:
         index, frame, stamp_ns: of the keyframe. T_imu_lidar: (4, 4).
         points: (n, 3) float32 m, LiDAR frame. labels: (n,) uint8. intensity: (n,) float32. ring: (n,) uint16.
-        level: how often it was thinned. joined: number of keyframes whose points it took over.
+        level: how often it was thinned.
     """
 
     index: int
@@ -190,7 +190,6 @@ class Chunk:
     ring: U16
     T_imu_lidar: F64
     level: int = 0
-    joined: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,8 +131,8 @@ class MapChunks:
         Args:
             poses: (k, 4, 4) T_map_imu of at least these keyframes. eyes: (e, 3) m, where cameras are in the map.
         """
-        same = (_same(drawn.chunk, chunk) for drawn, chunk in zip(self._drawn, chunks, strict=False))
-        self._keep(next((n for n, is_same in enumerate(same) if not is_same), min(len(chunks), len(self._drawn))))
+        same = [drawn.chunk.stamp_ns == chunk.stamp_ns for drawn, chunk in zip(self._drawn, chunks, strict=False)]
+        self._keep([*same, False].index(False))
         known = len(self._drawn)
         moved = self._move(poses[: len(chunks), :3])
         for chunk, T_map_imu in zip(chunks[known:], self._T_map_imu[known:], strict=True):
@@ -292,12 +292,3 @@ def shown_points(
     if clip is not None:
         mask &= clip.holds(lie.moved(T_map_lidar, chunk.points))
     return mask
-
-
-def _same(drawn: Chunk, chunk: Chunk) -> bool:
-    """Whether it is the same chunk or its later state: thinned, relabelled, or joined with another keyframe."""
-    if drawn is chunk:
-        return True
-    return (drawn.index, drawn.frame, drawn.stamp_ns) == (chunk.index, chunk.frame, chunk.stamp_ns) and (
-        drawn.level + drawn.joined <= chunk.level + chunk.joined
-    )

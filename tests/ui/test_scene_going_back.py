@@ -69,7 +69,7 @@ def test_of_keyframes_that_gave_their_points_away_no_node_is_left(
     drawn: Drawn, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server_chunks, "MOST_SHOWN", 5)
-    first = replace(drawn.engine.snapshot.chunks[0], joined=0)
+    first = drawn.engine.snapshot.chunks[0]
     poses = np.tile(np.eye(4), (40, 1, 1))
     poses[:, 0, 3] = np.arange(40)
     map_chunks, held = MapChunks(server.scene, "/other"), ()
