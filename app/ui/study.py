@@ -154,7 +154,8 @@ class StudyPanel:
         clicked, self._click = self._click, None
         before, self._of = self._of, result
         index = self._picked.index if self._picked is not None else None
-        if result is None or before is None or result.cloud.points is not before.cloud.points:
+        frames = [one and (one.stamp_ns, len(one.cloud)) for one in (before, result)]
+        if frames[0] != frames[1]:
             index = None  # the point belongs to another frame
         if clicked is not None and result is not None and not snapshot.transport.playing:
             index = point_at(result, clicked)

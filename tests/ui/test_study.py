@@ -3,6 +3,7 @@
 Tests app/ui/study_maths.py.
 """
 
+import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -213,6 +214,7 @@ def test_a_clicked_point_is_marked_and_reported_until_another_frame_comes(bench:
     assert bench.panel._picked is not None and "ring" in bench.panel._point.content
     assert {"/map/study/point", "/map/study/neighbours", "/map/study/patch"} <= bench.nodes
     bench.engine.send(SetParams({"ground.sigma": 0.2}))
+    bench.engine.publish(result=pickle.loads(pickle.dumps(bench.engine.snapshot.result)))  # as from another process
     bench.draw()
     assert bench.panel._picked.threshold == pytest.approx(0.2 * bench.panel._picked.range)
     bench.engine.send(Seek(3))
