@@ -17,7 +17,7 @@ from app.ui.chunks import shown_points
 from app.ui.geometry import wxyz
 from app.ui.html import panel
 from app.ui.loops.edges import nearest
-from app.ui.loops.inspector import MOST_POINTS, Overlay, Pairing
+from app.ui.loops.inspector import MOST_POINTS, Overlay
 from app.ui.loops.words import NEWER, OLDER
 from app.ui.nodes import add_exact_points, clear
 from app.ui.widgets import ROOT, Changes, Edit, Page, View, add_button, by_user, limited, show
@@ -54,12 +54,14 @@ class Nudging:
     """Two clouds; the user moves the newer one by arrows and rings.
 
     Attributes:
+        older, newer: (n, 3) their points, in the upright frames of the keyframes.
         T_map_older, T_map_newer: (4, 4) poses of the keyframes at the start.
         guess: the last pose of the newer cloud; not sent while it is being moved.
     """
 
     pair: Pair
-    clouds: Pairing
+    older: F32
+    newer: F32
     T_map_older: F64
     T_map_newer: F64
     gizmo: viser.TransformControlsHandle
@@ -163,14 +165,14 @@ class AddLoopPanel:
         wanted = self._is_possible(len(poses)) and self._nudge.value
         if nudging is not None and (not wanted or nudging.pair != pair):
             nudging.gizmo.remove()
-            self._overlay.draw(None, None, view.point_size)
+            self._overlay.clear()
             self._nudging = nudging = None
         if not wanted:
             return
         if nudging is None:
             nudging = self._nudging = self._begin(snapshot.chunks, poses, view)
         T, now, guess = nudging.T_map, self._page.now(), nudging.guess
-        self._overlay.draw(nudging.clouds, T, view.point_size)
+        self._overlay.draw(nudging.older, nudging.newer, upright(nudging.T_map_older), T, view.point_size)
         if not np.array_equal(T, guess.value):
             nudging.guess = Edit(T, now)
         elif not guess.sent and now - guess.at >= _REST_S:
@@ -184,8 +186,7 @@ class AddLoopPanel:
             f"{_NODE}/gizmo", scale=1.6, depth_test=False, wxyz=wxyz(T[:3, :3]), position=T[:3, 3]
         )
         there, here = (surroundings(chunks, poses, index, view.ceilings) for index in self.pair)
-        pairing = Pairing(there, here, upright(poses[older]))
-        nudging = Nudging(self.pair, pairing, poses[older], poses[newer], gizmo, Edit(T, 0.0, sent=True))
+        nudging = Nudging(self.pair, there, here, poses[older], poses[newer], gizmo, Edit(T, 0.0, sent=True))
         nudging.guess.value = nudging.T_map
         return nudging
 

@@ -1,7 +1,6 @@
 """Everything about one loop: its numbers, its Scan Contexts, its residuals, and both submaps superimposed."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -14,7 +13,7 @@ from app.slam.loops.scan_context import YAWS
 from app.slam.loops.types import LoopDetail, LoopEdge, Pair
 from app.slam.sections import LoopsParams
 from app.slam.types import F32, F64, NON_GROUND, U8
-from app.ui.colours import TABLES, Rgb
+from app.ui.colours import TABLES
 from app.ui.html import heading, panel
 from app.ui.loops.words import NEWER, OLDER, evidence
 from app.ui.nodes import add_exact_points, clear, place
@@ -43,34 +42,27 @@ def without_ceiling(points: F32) -> F32:
     return points[below_ceiling(points, np.full(len(points), NON_GROUND, np.uint8), np.array([0.0, 0.0, 1.0]))]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pairing:
-    """Two clouds to superimpose, each in its own frame.
-
-    Attributes:
-        older, newer: (n, 3). T_map_older: (4, 4) of the older cloud's frame.
-    """
-
-    older: F32
-    newer: F32
-    T_map_older: F64
-
-
 class Overlay:
-    """The two clouds as nodes below `root`. Their points are sent once; moving the slider sends only a pose."""
+    """Two superimposed clouds, nodes below `root`. Their points are sent once; moving one of them sends only a pose."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
         self._scene, self._root = scene, root
         self._nodes: list[viser.PointCloudHandle] = []
         self._changes = Changes()
 
-    def draw(self, pairing: Pairing | None, T_map_newer: F64 | None, point_size: float) -> None:
-        """Show the clouds with the newer one's frame at `T_map_newer` (4, 4); None removes them."""
-        clouds: list[tuple[str, F32, Rgb, F64]] = []
-        if pairing is not None and T_map_newer is not None:
-            both = ("older", pairing.older, OLDER, pairing.T_map_older), ("newer", pairing.newer, NEWER, T_map_newer)
-            clouds = [cloud for cloud in both if len(cloud[1])]  # the page cannot draw a cloud without points
-        if self._changes(*(points for _, points, *_ in clouds)):
+    @property
+    def shown(self) -> bool:
+        return bool(self._nodes)
+
+    def clear(self) -> None:
+        clear(self._nodes)
+        self._changes()
+
+    def draw(self, older: F32, newer: F32, T_map_older: F64, T_map_newer: F64, point_size: float) -> None:
+        """Show (n, 3) points of both, each in its own frame, which is placed by a (4, 4) pose."""
+        both = ("older", older, OLDER, T_map_older), ("newer", newer, NEWER, T_map_newer)
+        clouds = [cloud for cloud in both if len(cloud[1])]  # the page cannot draw a cloud without points
+        if self._changes(older, newer):
             clear(self._nodes)
             for name, points, colour, _ in clouds:
                 node, some = f"{self._root}/{name}", points[:MOST_POINTS]
@@ -90,7 +82,6 @@ class Inspector:
     def __init__(self, page: Page, act: Callable[[str, viser.ClientHandle], None]) -> None:
         gui = page.gui
         self._overlay = Overlay(page.scene, f"{ROOT}/submaps")
-        self._pairing: Pairing | None = None
         self._clouds: tuple[LoopDetail, bool, F32, F32] | None = None
         self._changes = Changes()
         self._alone_before: bool | None = None  # the user's choice, while the map replaces the submaps
@@ -134,7 +125,7 @@ class Inspector:
     @property
     def shown(self) -> bool:
         """Whether the two submaps are in the scene."""
-        return self._pairing is not None
+        return self._overlay.shown
 
     @property
     def alone(self) -> bool:
@@ -172,17 +163,15 @@ class Inspector:
         if self._alone_before is not None and not self._alone.value:
             detail = None
         if detail is None or chosen is None or chosen[1] >= len(poses):
-            self._pairing = None
-            self._overlay.draw(None, None, view.point_size)
+            self._overlay.clear()
             return
         T_map_older = poses[chosen[0]] @ detail.T_imu_level
         if self._clouds is None or self._clouds[0] is not detail or self._clouds[1] != view.ceilings:
             both = detail.older, detail.newer
             older, newer = both if view.ceilings else map(without_ceiling, both)
             self._clouds = detail, view.ceilings, older, newer
-        self._pairing = Pairing(*self._clouds[2:], T_map_older)
         T_map_newer = T_map_older @ on_the_way(detail.T_guess, detail.T_registered, self._share.value)
-        self._overlay.draw(self._pairing, T_map_newer, max(view.point_size, _LEAST_POINT_M))
+        self._overlay.draw(*self._clouds[2:], T_map_older, T_map_newer, max(view.point_size, _LEAST_POINT_M))
 
 
 def _detail(snapshot: Snapshot, pair: Pair | None) -> LoopDetail | None:
