@@ -2,6 +2,7 @@
 
 import logging
 from concurrent.futures import Future
+from typing import NamedTuple
 
 from app.export.results import Results
 from app.georeference.survey import Survey
@@ -15,17 +16,27 @@ from app.slam.map_frame import MapFrame
 log = logging.getLogger(__name__)
 
 
+class Inputs(NamedTuple):
+    """What the work depends on."""
+
+    session: Session | None = None
+    survey: Survey | None = None
+    overrides: tuple[Override, ...] = ()
+    frame: int = -1
+    map_frame: MapFrame | None = None
+
+
 class Georeferencing:
     """Starts the work in a thread of the session and collects its results; one thread calls `update`."""
 
     def __init__(self, page: Publisher) -> None:
         self._page, self._earth = page, Earth()  # `_earth`: as shown on the page
-        self._begun_from: tuple[object, ...] = (None, None, (), -1, None)  # inputs of the newest work
+        self._begun = Inputs()  # of the newest work
         self._under_way: Future[Results] | None = None
 
     def choose(self, session: Session, survey: Survey | None) -> None:
         """Georeference by this survey from now on. The page shows the choice at once, and the result when available."""
-        before = self._earth if self._begun_from[0] is session else Earth()
+        before = self._earth if self._begun.session is session else Earth()
         session.survey = survey
         source = survey and (survey.gnss, survey.control)
         same = before.survey and (before.survey.gnss, before.survey.control) == source
@@ -45,12 +56,13 @@ class Georeferencing:
         if session.loops is not None and not session.loops.idle:
             return False
         overrides = tuple(edit for edit in session.edits.done if isinstance(edit, Override))
-        now = session, session.survey, overrides, session.frame, session.map_frame
-        chosen = self._begun_from[0] is not session or self._begun_from[1:3] != now[1:3]
-        moved = self._begun_from[3] != session.frame or self._begun_from[4] is not session.map_frame
+        before, now = self._begun, Inputs(session, session.survey, overrides, session.frame, session.map_frame)
+        others = (before.survey, before.overrides) != (now.survey, now.overrides)
+        chosen = others or before.session is not session
+        moved = before.frame != now.frame or before.map_frame is not now.map_frame
         if session.frame < 0 or not (chosen or (moved and still and (session.survey is not None or session.ended))):
             return False
-        self._begun_from = now
+        self._begun = now
         if session.survey is None:
             self._show(session, Earth(), _levelling(session))
             return False
@@ -60,7 +72,7 @@ class Georeferencing:
     def _take(self, session: Session, work: Future[Results]) -> None:
         """Show the result of the work, unless the choice has changed meanwhile."""
         survey, error = session.survey, work.exception()
-        if self._begun_from[:2] != (session, survey):
+        if self._begun.session is not session or self._begun.survey != survey:
             return
         if error is None:
             results = work.result()
