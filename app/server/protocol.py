@@ -301,7 +301,7 @@ class Earth:
     problem: str = ""
 
 
-_NO_POSES, _NO_POSITIONS = np.empty((0, 4, 4)), np.empty((0, 3))
+_NO_POSES, _NO_POSITIONS, _NO_SERIES = np.empty((0, 4, 4)), np.empty((0, 3)), dict.fromkeys(SERIES, np.empty(0))
 """Empty values. All snapshots share these objects, which tells the page that nothing has changed."""
 
 
@@ -337,7 +337,7 @@ class Snapshot(Kept):
     corrections: MapFrame = field(default_factory=MapFrame)
     adjustment: MapFrame = field(default_factory=MapFrame)
     loops: LoopsView = LoopsView()
-    series: dict[str, F64] = field(default_factory=dict)
+    series: dict[str, F64] = field(default_factory=lambda: _NO_SERIES)
     T_map_truth: F64 | None = None
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     progress: Progress | None = None

@@ -136,7 +136,7 @@ class BrushPanel:
     def _go(self, word: str, _: viser.ClientHandle) -> None:
         """Handle what the list sends: "frame 1700000000000000000", with the frame's stamp."""
         snapshot = self._page.snapshot()
-        if snapshot.recording is not None and "stamp_s" in snapshot.series:
+        if snapshot.recording is not None:
             seconds = (int(word.removeprefix("frame ")) - snapshot.recording.start_ns) * 1e-9
             frames = np.flatnonzero(np.abs(snapshot.series["stamp_s"] - seconds) < 1e-3)
             if len(frames):

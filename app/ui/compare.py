@@ -166,7 +166,7 @@ class ComparePanel:
             titled = gui.add_folder(None, visible=False)
             with titled:
                 gui.add_html(heading(title))
-                self._plots.append((titled, chart(gui, (np.zeros(1),) * (1 + len(lines)), lines)))
+                self._plots.append((titled, chart(gui, lines)))
 
     def seen(self, view: View) -> View:
         """The view; without the scan while this panel draws it in other colours."""

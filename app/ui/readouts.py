@@ -56,7 +56,7 @@ def filter_tiles(result: StepResult) -> list[Tile]:
 def state_tiles(snapshot: Snapshot, result: StepResult) -> list[Tile]:
     state, series = result.state, snapshot.series
     speed = float(np.linalg.norm(state.v_odom_imu))
-    walked = float(series["distance"][-1]) if len(series.get("distance", ())) else np.nan
+    walked = float(series["distance"][-1]) if len(series["distance"]) else np.nan
     gyro, accel = 1000 * state.b_gyro, 1000 * state.b_accel
     gyro_norm, accel_norm = number(float(np.linalg.norm(gyro))), number(float(np.linalg.norm(accel)), 1)
     tiles = [
@@ -65,8 +65,7 @@ def state_tiles(snapshot: Snapshot, result: StepResult) -> list[Tile]:
         Tile("gyroscope bias", gyro_norm, "mrad/s", _vector(gyro, 2), width="half"),
         Tile("acceleration bias", accel_norm, "mm/s²", _vector(accel, 1), width="half"),
     ]
-    errors = series.get("error_m", np.empty(0))
-    if len(known := errors[np.isfinite(errors)]):
+    if len(known := series["error_m"][np.isfinite(series["error_m"])]):
         rms = f"cm · RMS {100 * float(np.sqrt(np.mean(known**2))):.1f} cm"
         tiles.append(Tile("position error to truth", number(100 * float(known[-1]), 1), rms, width="wide"))
     return tiles
@@ -94,7 +93,7 @@ def plotted(series: dict[str, F64], *names: str, worst: str = "") -> tuple[F64, 
         worst: "" for the newest frames; a series name: all frames in `HISTORY` parts, and from each part the frame
             with the greatest value of that series.
     """
-    count = len(series.get("stamp_s", ()))
+    count = len(series["stamp_s"])
     if not count:
         return (np.zeros(1),) * (1 + len(names))
     frames: slice | I64 = slice(-HISTORY, None)
@@ -137,17 +136,16 @@ class ReadoutPanel:
         )
         gui.add_html(heading("Frame time by stage, ms (peaks cut)"))
         layers = [{"stroke": colour, "width": 0, "fill": colour} for colour in colours]
-        self._stages = chart(gui, stacked_stages({}), layers)
+        self._stages = chart(gui, layers)
         gui.add_html(heading("λ3/λ2 of the seeds and its limit"))
-        nothing = plotted({}, "planarity")
         limit: dict[str, Any] = {"stroke": "#ff6b6b", "width": 1.0}
-        self._planarity = chart(gui, (*nothing, np.zeros(1)), [{"stroke": "#3ecf9a", "width": 1.5}, limit])
+        self._planarity = chart(gui, [{"stroke": "#3ecf9a", "width": 1.5}, limit])
         gui.add_html(heading("Residual (RMS), mm"))
-        self._residual = chart(gui, nothing, [{"stroke": "#40b8f0", "width": 1.5}])
+        self._residual = chart(gui, [{"stroke": "#40b8f0", "width": 1.5}])
         self._of_truth = gui.add_folder(None, visible=False)
         with self._of_truth:
             gui.add_html(heading("Position error to truth, cm"))
-            self._error = chart(gui, nothing, [{"stroke": "#ff5c8d", "width": 1.5}])
+            self._error = chart(gui, [{"stroke": "#ff5c8d", "width": 1.5}])
 
     def draw(self, snapshot: Snapshot) -> None:
         dropped = snapshot.transport.dropped

@@ -8,6 +8,7 @@ import viser
 
 from app.server.protocol import Snapshot
 from app.slam import lie, study
+from app.slam.params import Params
 from app.slam.types import F64, StepResult
 from app.ui.colours import LABEL_COLOURS
 from app.ui.geometry import disc, rotation_to
@@ -123,8 +124,9 @@ class StudyPanel:
         self._legend = gui.add_html(study_legend(None, AS_MAP))
         self._alone = gui.add_checkbox("only this frame", False, hint="Hide the map.")
         gui.add_html(heading("Distance to the ground plane over range, and σ · range"))
-        self._plot = _plot(gui, curve(None, 0.025))
-        self._summary = gui.add_html(panel("quiet", _PAUSE))
+        self._plot = _plot(gui)
+        self._summary = gui.add_html("")
+        self._draw_curve(None, Params().ground.sigma)
         gui.add_html(heading("A point"))
         self._neighbours = limited(
             gui.add_number("neighbours", 20, min=4, max=200, step=1, hint="Nearest points of this scan.")
@@ -202,10 +204,9 @@ def _scales(drawn: Curve) -> dict[str, Any]:
     return {"x": {"time": False}, "y": {"range": (0.0, HEADROOM * float(drawn.threshold[-1]))}}
 
 
-def _plot(gui: viser.GuiApi, drawn: Curve) -> viser.GuiUplotHandle:
+def _plot(gui: viser.GuiApi) -> viser.GuiUplotHandle:
     lines: list[dict[str, Any]] = [{"stroke": css(_THRESHOLD), "width": 1.5}]
     for colour in (css(LABEL_COLOURS[1]), css(LABEL_COLOURS[0])):
         points = {"show": True, "size": 2.5, "width": 0, "fill": colour}
         lines.append({"stroke": colour, "width": 0, "points": points})
-    data = (drawn.range, drawn.threshold, drawn.under, drawn.over)
-    return chart(gui, data, lines, 200, scales=_scales(drawn))
+    return chart(gui, lines, 200)

@@ -126,13 +126,12 @@ class History:
         if snapshot.session != self._session:
             self._session, self._columns, self._loops = snapshot.session, {}, {}
         self.total = max(recording.frames if recording else 1, 1)
-        count = min(len(series.get("stamp_s", ())), self.total)
+        count = min(len(series["stamp_s"]), self.total)
         truth = recording.truth if recording else None
         for key, value in _VALUES.items():
             column, before = np.full(self.total, np.nan), self._columns.get(key, np.empty(0))[: self.total]
             column[: len(before)] = before
-            if count:
-                column[:count] = value(series)[:count]
+            column[:count] = value(series)[:count]
             self._columns[key] = column
         if truth != self._truth:
             self._columns["error"][count:] = np.nan  # these are distances to another truth

@@ -288,13 +288,11 @@ def as_set(act: Callable[[Any, viser.ClientHandle], None]) -> Callback:
     return callback
 
 
-def chart(
-    gui: viser.GuiApi, data: tuple[F64, ...], lines: list[dict[str, Any]], height: int = 110, **options: Any
-) -> viser.GuiUplotHandle:
-    """A small chart over `data[0]`. lines: uPlot's series except the first one."""
+def chart(gui: viser.GuiApi, lines: list[dict[str, Any]], height: int = 110) -> viser.GuiUplotHandle:
+    """A small chart, still without data. lines: uPlot's series except the first one, over which they are drawn."""
     axes: Any = tuple({"font": "10px sans-serif", "ticks": {"size": 3}, "gap": 2, "size": size} for size in (22, 38))
-    settings: dict[str, Any] = {"scales": {"x": {"time": False}}, "cursor": {"show": False}} | options
     series: Any = ({"label": "x"}, *({"points": {"show": False}} | line for line in lines))
     return gui.add_uplot(
-        data, series, axes=axes, legend={"show": False}, height=height, padding=(6, 10, 0, 0), **settings
-    )
+        (np.zeros(1),) * len(series), series, axes=axes, scales={"x": {"time": False}}, legend={"show": False},
+        cursor={"show": False}, height=height, padding=(6, 10, 0, 0),
+    )  # fmt: skip

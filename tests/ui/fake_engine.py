@@ -252,7 +252,7 @@ class FakeEngine:
             chunks=(),
             keyframe_poses=np.empty((0, 4, 4)),
             trajectory=np.empty((0, 3)),
-            series={},
+            series=Snapshot().series,
             T_map_truth=None,
         )
 

@@ -106,9 +106,9 @@ class Inspector:
         self._contexts = gui.add_image(_NO_CONTEXTS, format="png")
         self._shifts_title = gui.add_html("")
         line, limit = {"stroke": "#40b8f0", "width": 1.5}, {"stroke": "#e08a00", "width": 1.5, "dash": [3, 3]}
-        self._shifts = chart(gui, (np.zeros(1),) * 3, [line, limit])
+        self._shifts = chart(gui, [line, limit])
         gui.add_html(heading("Histogram of the points' distances to the other submap's surface, mm"))
-        self._residuals = chart(gui, (np.zeros(1),) * 3, [line | {"fill": "#40b8f080"}, limit])
+        self._residuals = chart(gui, [line | {"fill": "#40b8f080"}, limit])
 
     def show_map(self) -> None:
         """Show the edited map in place of the submaps, until another loop or `alone` is chosen."""
