@@ -48,7 +48,7 @@ class BrushPanel:
             gui, "Undo mark", lambda _: page.send(UndoPaint()), viser.Icon.ARROW_BACK_UP, visible=False
         )
         self._bridge = Bridge(gui, "labelled", self._go)
-        self._list = gui.add_html("", visible=False)
+        self._list = gui.add_html("")
         self._save = add_button(gui, "Download labels", self._download, viser.Icon.DOWNLOAD, visible=False)
         self._load = gui.add_upload_button("Load labels", icon=viser.Icon.UPLOAD, color="gray", mime_type=".json")
         brush.on_click(by_user(lambda name, _: self.choose(name)))
@@ -70,7 +70,7 @@ class BrushPanel:
         found = marks(snapshot.painted)
         self._undo.visible = bool(snapshot.painted)
         self._rest.visible, self._rest.disabled, self._radius.visible = self.painting, playing, self.painting
-        self._save.visible = self._list.visible = bool(found)
+        self._save.visible = bool(found)
         self._why.content = panel("quiet", self._words(snapshot, bool(found)))
         start_ns, rows = snapshot.recording.start_ns if snapshot.recording else None, []
         for stamp, labels in found.items():

@@ -60,10 +60,10 @@ class CalibrationPanel:
         gui = page.gui
         self._button = add_button(gui, "Calibrate", lambda _: self._begin(), color=None, hint=_EXPLAINED, disabled=True)
         self._work = Background(gui, "calibrate", "Calibration", "Earlier results stay.")
-        self._html = gui.add_html("", visible=False)
+        self._html = gui.add_html("")
         self._apply = add_button(gui, "Apply", lambda _: self._apply_or_undo(), color=None, visible=False)
         self._keep = add_button(gui, "Keep", lambda _: self._write(), hint=_KEEPS, visible=False)
-        self._plot = gui.add_html("", visible=False)
+        self._plot = gui.add_html("")
         self._found = FoundMounting([], {})
         self._before: dict[str, Any] = {}  # values that the result replaced; empty while it is not applied
         self._file: bytes | None = None  # the parameter file beside the recording, before it was written
@@ -79,7 +79,8 @@ class CalibrationPanel:
         if recording != self._of:  # the result belongs to another recording
             self.close()
             self._of, self._found, self._before, self._tried = recording, FoundMounting([], {}), {}, not self._unasked
-            self._html.visible = self._apply.visible = self._keep.visible = self._plot.visible = False
+            self._apply.visible = self._keep.visible = False
+            self._html.content = self._plot.content = ""
             self._heard = snapshot.last_notice
         self._button.disabled = self._work.running or recording is None or recording == LIVE
         doubted = any(one.number > self._heard and one.text.startswith(IN_DOUBT) for one in snapshot.notices)
@@ -102,7 +103,7 @@ class CalibrationPanel:
             found = replace(found, rows=[("", f"{found.contradiction}."), *found.rows])
         self._found, self._before, self._keep.visible = found, {}, False
         self._tell()
-        self._plot.content, self._plot.visible = panel("figure", found.plot), bool(found.plot)
+        self._plot.content = panel("figure", found.plot)
         self._offer()
         self._sentence = ""
         if found.contradiction and found.values:
@@ -112,7 +113,7 @@ class CalibrationPanel:
 
     def _tell(self, *more: tuple[str, str]) -> None:
         """Show the result, and what was done with it."""
-        self._html.content, self._html.visible = panel("calibration", [*self._found.rows, *more]), True
+        self._html.content = panel("calibration", [*self._found.rows, *more])
 
     def _use_or_advise(self, contradiction: str) -> None:
         """If no mounting is known, apply a result that nobody asked for; otherwise say how to apply it."""

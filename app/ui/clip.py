@@ -78,7 +78,7 @@ class ClipPanel:
         )
         hint = "Click two points: the clip box becomes the slab between them."
         add_button(gui, "Cut by two clicks", self._begin_cut, viser.Icon.SLICE, hint=hint)
-        self._asked = gui.add_html("", visible=False)
+        self._asked = gui.add_html("")
         self._unrolled = gui.add_checkbox(
             "profile", False, hint="The map along the walked path: distance walked to the right, height up."
         )
@@ -106,8 +106,8 @@ class ClipPanel:
         if clip != self._shown:
             self._shown, self._dragged = clip, None
             self._show(clip)
-        self._asked.visible = self._measure.taker == self._picked
-        self._asked.content = panel("note", f"Click the {'other' if self._measure.spots else 'first'} end on the map.")
+        asked = f"Click the {'other' if self._measure.spots else 'first'} end on the map."
+        self._asked.content = panel("note", asked) if self._measure.taker == self._picked else ""
         box = None if clip.unrolled else clip.hiding
         if self._scene_changes(box, self._dragged, self._held, self._pull.value):
             self._draw_scene(box)

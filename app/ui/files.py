@@ -170,15 +170,15 @@ class FilesPanel:
             "plot the distance to it.",
         )
         self._save = add_button(gui, "Save results…", self.ask_where, viser.Icon.DEVICE_FLOPPY, disabled=True)
-        self._saved = gui.add_html("", visible=False)
+        self._saved = gui.add_html("")
         self._download = add_button(gui, "Download…", self._offer, viser.Icon.DOWNLOAD, visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
         self._save.disabled = snapshot.result is None
         self._compare.disabled = snapshot.recording is None or snapshot.live is not None
         folder = last_saved(snapshot)
-        self._saved.visible = self._download.visible = folder is not None
-        self._saved.content = panel("path", "Saved in ", str(folder))
+        self._download.visible = folder is not None
+        self._saved.content = panel("path", "Saved in ", str(folder)) if folder is not None else ""
 
     def browse(self, client: viser.ClientHandle) -> None:
         def choose(path: Path) -> None:
@@ -257,7 +257,7 @@ class FilesPanel:
             moving = gui.add_checkbox(
                 "with moving points", True, hint="Marked in PLY, PCD, LAS and LAZ; other formats omit them."
             )
-            problem = gui.add_html("", visible=False)
+            problem = gui.add_html("")
             save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
 
         def confirmed(_: object) -> None:
@@ -269,7 +269,7 @@ class FilesPanel:
                 folder = self._results / folder_name(name.value)
                 choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
             except HemislamError as error:
-                problem.content, problem.visible = panel("text", str(error)), True
+                problem.content = panel("text", str(error))
                 return
             self._page.send(Save(folder, formats, choice))
             close()

@@ -102,7 +102,7 @@ class LivePanel:
 
     def __init__(self, page: Page) -> None:
         self._page = page
-        self._html = page.gui.add_html("", visible=False)
+        self._html = page.gui.add_html("")
         hint = "Start a new map from the data that the sensor sends from now on. The file of --record has no gap."
         self._back = add_button(
             page.gui,
@@ -119,9 +119,8 @@ class LivePanel:
         self._page.send(Play())
 
     def draw(self, snapshot: Snapshot) -> None:
-        self._was_live |= snapshot.live is not None
-        self._html.visible = snapshot.live is not None
-        self._back.visible = self._was_live and snapshot.live is None and snapshot.progress is None
-        if snapshot.live is not None:
-            transport = snapshot.transport
-            self._html.content = live_html(snapshot.live, ended=transport.finished, paused=not transport.playing)
+        live, transport = snapshot.live, snapshot.transport
+        self._was_live |= live is not None
+        self._back.visible = self._was_live and live is None and snapshot.progress is None
+        ended, paused = transport.finished, not transport.playing
+        self._html.content = live_html(live, ended=ended, paused=paused) if live is not None else ""

@@ -45,7 +45,7 @@ class MapComparePanel:
         self._density = Density(page.now)
         self._changes = Changes()
         gui.add_html(panel("quiet", _WHAT))
-        self._found = gui.add_html("", visible=False)
+        self._found = gui.add_html("")
         self._choose = add_button(gui, "Choose a map…", self._browse, viser.Icon.FOLDER_OPEN, hint="PLY, LAS, LAZ.")
         hint = "The same scans, placed at the true poses."
         self._truth = add_button(
@@ -84,9 +84,8 @@ class MapComparePanel:
         self._truth.visible = recording is not None and recording.truth is not None
         old = self._distance is not None and current.chunks is not self._chunks
         if self._changes(self._comparison, old):
-            self._found.visible = self._comparison is not None
-            if self._comparison is not None:
-                self._found.content = summary(self._comparison, self._name, [_OLD] if old else [])
+            found = self._comparison
+            self._found.content = summary(found, self._name, [_OLD] if old else []) if found is not None else ""
 
     def close(self) -> None:
         """Stop the comparison that is running, if any."""

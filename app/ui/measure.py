@@ -56,9 +56,9 @@ class MeasurePanel:
         self._light = False
         self._kinds = gui.add_button_group("measure", tuple(_SPOTS), hint="Then click points of the map.")
         self._kinds.on_click(by_user(lambda kind, _: self.begin(kind.removeprefix(_CHOSEN))))
-        self._asked = gui.add_html("", visible=False)
+        self._asked = gui.add_html("")
         self._bridge = Bridge(gui, "measures", self._act)
-        self._list = gui.add_html("", visible=False)
+        self._list = gui.add_html("")
         self._name = gui.add_text("name", "", hint="Name of the next measure; empty: a number.")
         self._snap = gui.add_checkbox(
             "snap to corners",
@@ -153,11 +153,11 @@ class MeasurePanel:
         asked = f"{self._kind.capitalize()}: click {points} of the map." if left else ""
         if self.picking and not map_shown:
             asked = "The map is hidden; show it to click on points."
-        self._asked.content, self._asked.visible = panel("text", asked), bool(asked)
+        self._asked.content = panel("text", asked) if asked else ""
         rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]
         waiting = f"{later} more on keyframes that are not in the map now." if later else ""
         self._list.content = self._bridge.live(panel("measures", rows, waiting)) if rows or later else ""
-        self._list.visible, self._save.visible = bool(rows or later), bool(rows)
+        self._save.visible = bool(rows)
 
     def clicked(self, event: viser.SceneClickEvent) -> bool:
         """Take a click in the scene while measuring; `draw` uses it. Returns whether it was taken."""

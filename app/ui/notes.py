@@ -36,13 +36,12 @@ class NotesPanel:
         self._bridge = Bridge(page.gui, "notes", self._act)
         self._text = page.gui.add_text("note", "", hint="A note on the frame shown; kept in the session.")
         self._add = add_button(page.gui, "Add note", lambda _: self._note(), viser.Icon.NOTE)
-        self._list = page.gui.add_html("", visible=False)
+        self._list = page.gui.add_html("")
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
         self._draw_pins(snapshot, view)
         listed = [(_word(place, note), note) for place, note in enumerate(snapshot.notes)][-_SHOWN_NOTES:][::-1]
         self._list.content = self._bridge.live(panel("notes", listed)) if listed else ""
-        self._list.visible = bool(snapshot.notes)
 
     def _note(self) -> None:
         if self._text.value.strip():

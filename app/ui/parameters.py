@@ -237,7 +237,7 @@ class ParameterPanel:
         self._undo = add_button(gui, "Undo", lambda _: self._step(-1), viser.Icon.ARROW_BACK_UP, disabled=True)
         self._redo = add_button(gui, "Redo", lambda _: self._step(1), viser.Icon.ARROW_FORWARD_UP, disabled=True)
         self._add_reset("primary")
-        self._pending = gui.add_html("", visible=False)
+        self._pending = gui.add_html("")
         self._restart = add_button(
             gui, "Restart now", lambda _: self._send(Restart()), viser.Icon.REFRESH, color="orange", visible=False
         )
@@ -282,8 +282,8 @@ class ParameterPanel:
         if self._resets_due(snapshot.params, self._opened):
             self._show_resets(snapshot.params)
         self._show_ground(snapshot, tuning)
-        self._pending.visible = self._restart.visible = bool(snapshot.pending_restart)
-        self._pending.content = panel("pending", snapshot.pending_restart)
+        self._restart.visible = bool(snapshot.pending_restart)
+        self._pending.content = panel("pending", snapshot.pending_restart) if snapshot.pending_restart else ""
 
     def _show_ground(self, snapshot: Snapshot, tuning: bool) -> None:
         ground = snapshot.result.ground if snapshot.result is not None else None
@@ -379,7 +379,7 @@ def _load_yaml(client: viser.ClientHandle, page: Page) -> None:
     with dialog(client, "Load parameters") as close:
         client.gui.add_html(panel("text", "Paste YAML or choose a file. Parameters it omits return to their defaults."))
         text = client.gui.add_text("yaml", "", multiline=True)
-        problem = client.gui.add_html("", visible=False)
+        problem = client.gui.add_html("")
         upload = client.gui.add_upload_button("Choose a file", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,text/yaml")
         apply = client.gui.add_button("Apply", icon=viser.Icon.CHECK)
 
@@ -387,7 +387,7 @@ def _load_yaml(client: viser.ClientHandle, page: Page) -> None:
         try:
             Params().merged_yaml(text.value)
         except HemislamError as error:
-            problem.content, problem.visible = panel("problem", str(error)), True
+            problem.content = panel("problem", str(error))
             return
         page.send(LoadParams(text.value))
         close()

@@ -58,7 +58,7 @@ class PicturesPanel:
         self._start = add_button(gui, "Fly along the path", self._fly, viser.Icon.MOVIE, hint=hint)
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._stop = add_button(gui, "Stop", lambda _: self.close(), viser.Icon.PLAYER_STOP, visible=False)
-        self._where = gui.add_html("", visible=False)
+        self._where = gui.add_html("")
         self._download = add_button(gui, "Download the flight", self._send, viser.Icon.DOWNLOAD, visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -68,9 +68,8 @@ class PicturesPanel:
             self._progress.visible = self._stop.visible = flying
             show(self._progress, 100 * self._share)
             done = not flying and self._saved.is_file()
-            self._where.visible = self._download.visible = done
-            if done:
-                self._where.content = panel("path", "Saved as ", str(self._saved))
+            self._download.visible = done
+            self._where.content = panel("path", "Saved as ", str(self._saved)) if done else ""
 
     def close(self) -> None:
         """Stop flying."""

@@ -115,15 +115,14 @@ class DoctorPanel:
         self._page = page
         self._changes = Changes()
         self._bridge = Bridge(gui, "doctor", lambda word, _: self._settle(word.removeprefix("settle ")))
-        self._title = gui.add_html(heading("Checks of this recording"), visible=False)
-        self._html = gui.add_html("", visible=False)
+        self._html = gui.add_html("")
 
     def draw(self, snapshot: Snapshot) -> None:
         if not self._changes(snapshot.recording, snapshot.params):
             return
         findings = snapshot.recording.findings if snapshot.recording else ()
-        self._title.visible = self._html.visible = bool(findings)
-        self._html.content = self._bridge.live(findings_html(findings, snapshot.params))
+        html = heading("Checks of this recording") + self._bridge.live(findings_html(findings, snapshot.params))
+        self._html.content = html if findings else ""
 
     def _settle(self, option: str) -> None:
         """Apply a finding's option; if it affects how the recording is read, read it again."""
@@ -143,8 +142,7 @@ class NoticePanel:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._title = server.gui.add_html(heading("Messages"), visible=False)
-        self._log = server.gui.add_html("", visible=False)
+        self._log = server.gui.add_html("")
         self._shown: set[int] = set()
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -153,8 +151,7 @@ class NoticePanel:
         if not new:
             return
         self._shown |= {notice.number for notice in new}
-        self._title.visible = self._log.visible = True
-        self._log.content = log_html(snapshot.notices)
+        self._log.content = heading("Messages") + log_html(snapshot.notices)
         for client in self._server.get_clients().values():
             for notice in new:
                 title, _, colour, seconds = _LEVELS[notice.level]

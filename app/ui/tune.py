@@ -71,7 +71,7 @@ class TunePanel:
         )
         self._work = Background(gui, "tune", "The search", "Finished runs stay.")
         self._bridge = Bridge(gui, "trials", self._clicked)
-        self._plots = gui.add_html("", visible=False)
+        self._plots = gui.add_html("")
 
     def draw(self, snapshot: Snapshot) -> None:
         recording = snapshot.recording.path if snapshot.recording else None
@@ -87,8 +87,7 @@ class TunePanel:
         if self._changes(self._found, self._chosen, running, done, problem):
             self._why.content = panel("quiet", problem or self._words())
             objectives = self._objectives()
-            html = maths.plots(self._found, objectives, self._chosen) if objectives else ""
-            self._plots.content, self._plots.visible = self._bridge.live(html), bool(html)
+            self._plots.content = self._bridge.live(maths.plots(self._found, objectives, self._chosen))
             if self._wanted is not None:
                 self._work.show(min(done / (self._wanted.trials + 1), 1.0))
 

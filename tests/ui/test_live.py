@@ -107,11 +107,11 @@ def test_a_sensor_s_words_are_no_html() -> None:
 def test_the_panel_takes_no_place_while_a_recording_is_open(server: viser.ViserServer, engine: FakeEngine) -> None:
     panel = LivePanel(page_of(server))
     panel.draw(engine.snapshot)
-    assert not panel._html.visible
+    assert not panel._html.content
     panel.draw(replace(engine.snapshot, live=WELL))
-    assert panel._html.visible and "receiving" in panel._html.content
+    assert "receiving" in panel._html.content
     panel.draw(engine.snapshot)
-    assert not panel._html.visible
+    assert not panel._html.content
 
 
 def test_from_a_recording_there_is_a_way_back_to_the_live_source(server: viser.ViserServer, engine: FakeEngine) -> None:

@@ -127,7 +127,7 @@ def test_another_session_has_no_comparison_and_the_colours_from_before(comparing
     comparing.now = replace(NOW, session=NOW.session + 1)
     comparing.draw()
     assert comparing.modes == [DISTANCE, HEIGHT] and comparing.process is None
-    assert not comparing.panel._found.visible
+    assert not comparing.panel._found.content
     assert comparing.panel.seen(comparing.now, View(colour_by=DISTANCE)).numbers is None
 
 

@@ -67,12 +67,12 @@ def test_what_was_typed_last_is_noted_however_late_the_threads_are(
 
 
 def test_the_newest_is_on_top_with_its_frame_and_without_notes_there_is_no_list(notes: Notes) -> None:
-    assert not notes.panel._list.visible
+    assert not notes.panel._list.content
     shown = notes.show(Note(70, "a turn"), Note(12_345, "the lift"))
-    assert notes.panel._list.visible
+    assert notes.panel._list.content
     assert shown.index("12,345") < shown.index("the lift") < shown.index("70") < shown.index("a turn")
     notes.show()
-    assert not notes.panel._list.visible, "another session is open"
+    assert not notes.panel._list.content, "another session is open"
 
 
 def test_of_many_the_last_are_shown(notes: Notes) -> None:

@@ -70,7 +70,7 @@ told: list[str] = []
 
 
 def test_before_a_search_the_tab_says_what_to_do(tuning: Tuning) -> None:
-    assert tuning.says("press Start") and not tuning.panel._plots.visible
+    assert tuning.says("press Start") and "hs-plot" not in tuning.panel._plots.content
     tuning.now = Snapshot()
     tuning.draw()
     assert tuning.says("Open a recording first") and tuning.panel._start.disabled
@@ -161,7 +161,7 @@ def test_another_recording_ends_the_search_and_forgets_its_trials(tuning: Tuning
     assert OPEN.recording is not None
     tuning.now = replace(OPEN, recording=replace(OPEN.recording, path=Path("other.mcap")))
     tuning.draw()
-    assert process.closed and tuning.says("press Start") and not tuning.panel._plots.visible
+    assert process.closed and tuning.says("press Start") and "hs-plot" not in tuning.panel._plots.content
 
 
 # --- where trials lie ----------------------------------------------------------------------------

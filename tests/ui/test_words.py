@@ -50,9 +50,9 @@ def test_a_live_source_without_checks_has_no_heading_for_them(server: viser.Vise
     doctor, recording = DoctorPanel(page_of(server)), engine.snapshot.recording
     assert recording is not None
     doctor.draw(engine.snapshot)
-    assert doctor._title.visible
+    assert "Checks of this recording" in doctor._html.content
     doctor.draw(replace(engine.snapshot, recording=replace(recording, findings=())))
-    assert not doctor._title.visible
+    assert not doctor._html.content
 
 
 def test_the_time_of_every_stage_has_its_unit() -> None:

@@ -109,7 +109,7 @@ class AddLoopPanel:
             hint="First move the newer submap with arrows and rings. Off: the guess is its pose in the graph.",
         )
         self._try = add_button(gui, "Try it", lambda _: self.suggest(), viser.Icon.LINK, color=None)
-        self._problem = gui.add_html("", visible=False)
+        self._problem = gui.add_html("")
         self._nudge.on_update(by_user(self._look))
 
     @property
@@ -143,8 +143,8 @@ class AddLoopPanel:
         older, newer = self.pair
         good = 0 <= older < newer < count
         self._tried &= not good
-        self._problem.visible = not good and (self._tried or self._nudge.value)
-        self._problem.content = panel("text", f"Choose two of the {count} keyframes, the older one first.")
+        problem = panel("text", f"Choose two of the {count} keyframes, the older one first.")
+        self._problem.content = problem if not good and (self._tried or self._nudge.value) else ""
         return good
 
     def pick(self, origin: F64, direction: F64) -> None:

@@ -32,24 +32,24 @@ def test_a_pair_that_makes_no_sense_is_not_sent(page: Page) -> None:
     for pair in ((5, 5), (9, 3), (3, KEYFRAMES)):
         added.suggest_pair(pair)
         user_clicks(added._try)
-        assert added._problem.visible
+        assert added._problem.content
     assert page.engine.sent == []
     added.suggest_pair((3, 9))
     page.draw()
-    assert not added._problem.visible
+    assert not added._problem.content
 
 
 def test_keyframes_that_cannot_be_nudged_are_refused_in_words(page: Page) -> None:
     added = page.loops._add_loop
     added.suggest_pair((9, 3))
     page.draw()
-    assert not added._problem.visible, "nothing is to be done with them yet"
+    assert not added._problem.content, "nothing is to be done with them yet"
     added._nudge.value = True
     page.draw()
-    assert added._problem.visible and not added.nudging
+    assert added._problem.content and not added.nudging
     added.suggest_pair((3, 9))
     page.draw()
-    assert not added._problem.visible and added.nudging
+    assert not added._problem.content and added.nudging
 
 
 def test_a_nudged_guess_is_tried_when_the_hand_rests_and_is_where_the_cloud_was_put(page: Page) -> None:
