@@ -122,7 +122,6 @@ class ReadoutPanel:
         gui = page.gui
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._tiles = gui.add_html("")
-        self._time = gui.add_html("")
         self._plots = gui.add_folder(None, visible=False)
         with self._plots:
             self._add_plots(gui)
@@ -155,15 +154,13 @@ class ReadoutPanel:
         self._plots.visible = result is not None
         if result is None:
             self._tiles.content = panel("quiet", "Press Play or Step below: numbers appear with the first frame.")
-            self._time.content = ""
         else:
             sections = [
                 ("Ground", ground_tiles(result, snapshot.params.ground.planarity)),
                 ("Filter", filter_tiles(result)),
                 ("Motion", state_tiles(snapshot, result)),
             ]
-            self._tiles.content = panel("readouts", sections, "Time")
-            self._time.content = times_html(snapshot, result)
+            self._tiles.content = panel("readouts", sections) + times_html(snapshot, result)
         series, whole = snapshot.series, self._whole.value
         self._stages.data = stacked_stages(series, "total_ms" if whole else "")
         stamps, planarity = plotted(series, "planarity", worst="planarity" if whole else "")
