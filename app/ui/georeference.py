@@ -100,7 +100,7 @@ class GeoreferencePanel:
         if self._by.value == CONTROL and not self._control:
             raise HemislamError("Load a table of control points first.")
         before = self._page.snapshot().earth.survey
-        x = numbers_in(self._lever.value, "lever arm", 3)
+        arm = numbers_in(self._lever.value, "lever arm", 3)
         offset = numbers_in(self._offset.value, "clock offset", 1)
         by_points = self._by.value == CONTROL
         return Survey(
@@ -109,7 +109,7 @@ class GeoreferencePanel:
             picks=before.picks if before is not None else (),
             crs=self._crs.value.strip(),
             height=self._height.value.strip(),
-            lever=(x[0], x[1], x[2]) if x and not by_points else None,
+            lever=(arm[0], arm[1], arm[2]) if arm and not by_points else None,
             offset_s=offset[0] * 1e-3 if offset and not by_points else None,
             factors=self._use.value == _FACTORS and not by_points,
         )

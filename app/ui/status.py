@@ -80,14 +80,15 @@ def settled(params: Params, option: str) -> Params | None:
 
 def findings_html(findings: tuple[Finding, ...], params: Params) -> str:
     """The findings, those that need the user first, with a button if an option would help; passed ones are folded."""
-    rows: dict[str, list[tuple[Finding, str, str, str, bool]]] = {verdict: [] for verdict in reversed(_LOOKS)}
-    for finding in findings:
+
+    def row(finding: Finding) -> tuple[Finding, str, str, str, bool]:
         needed = finding.verdict == "needs you"
         after = settled(params, finding.option) if finding.verdict != "fine" else None
         change = "" if after in (None, params) else "Settle it" if needed else "Use this instead"
-        rows[finding.verdict].append((finding, *_LOOKS[finding.verdict], change, needed and after is None))
-    fine = rows.pop("fine")
-    return panel("findings", [row for unsettled in rows.values() for row in unsettled], fine)
+        return finding, *_LOOKS[finding.verdict], change, needed and after is None
+
+    rows = {verdict: [row(finding) for finding in findings if finding.verdict == verdict] for verdict in _LOOKS}
+    return panel("findings", rows["needs you"] + rows["corrected"], rows["fine"])
 
 
 def verdicts(findings: tuple[Finding, ...]) -> tuple[str, str] | None:
