@@ -1,7 +1,6 @@
 """Moves the open session through its frames: playing at a speed, stepping and seeking in both directions."""
 
 import logging
-import re
 import time
 from collections import deque
 from collections.abc import Callable
@@ -98,7 +97,6 @@ class Player:
         self.page_behind = self.relabelling = False
         self._target: SeekTarget | None = None
         self._moment: CheckedFrame | None = None  # the frame that the page shows
-        self._doubted: set[str] = set()  # reasons already reported, without their numbers
 
     # --- requests --------------------------------------------------------------------------------
     def take(self, session: Session) -> None:
@@ -106,7 +104,6 @@ class Player:
         self.session = session
         self.relabelling = self.page_behind = False
         self._moment = None
-        self._doubted = set()
         self._page.opened(session)
         if session.feed.repeatable:
             self._page.put(live=None)
@@ -273,10 +270,7 @@ class Player:
     def _doubt(self, session: Session) -> None:
         """Report why the run may be wrong, each reason once."""
         for doubt in doubts(session.log, session.loops.tied_ns if session.loops else NO_PAUSES):
-            reason = re.sub(r"[\d.]+", "#", doubt)
-            if reason not in self._doubted:
-                self._doubted.add(reason)
-                self._page.notice("warning", f"{IN_DOUBT} {doubt}")
+            self._page.notice_once(f"{IN_DOUBT} {doubt}")
 
     def _passed(self, session: Session, result: StepResult, *, played: bool) -> None:
         """Pause if a breakpoint is met, unless a seek only passes the frame."""

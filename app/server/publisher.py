@@ -87,12 +87,12 @@ class Publisher:
         self._notices.append(Notice(self._notices_given, level, text))
         self.urgent = True
 
-    def notice_once(self, text: str, stamp_ns: int) -> None:
-        """Warn, unless the same sentence (numbers aside) was shown a moment ago."""
+    def notice_once(self, text: str, stamp_ns: int | None = None) -> None:
+        """Warn, unless the same sentence (numbers aside) was shown a moment before this stamp; None: in the session."""
         kind = re.sub(r"[\d.]+", "#", text)
         last = self._noticed.get(kind)
-        if last is None or abs(stamp_ns - last) > REPEAT_AFTER_S * 1e9:
-            self._noticed[kind] = stamp_ns
+        if last is None or (stamp_ns is not None and abs(stamp_ns - last) > REPEAT_AFTER_S * 1e9):
+            self._noticed[kind] = stamp_ns or 0
             self.notice("warning", text)
 
     def begin(self, frames: Log[Frame], keyframes: Keyframes) -> None:
