@@ -108,8 +108,8 @@ def test_a_bridge_that_offers_a_new_type_is_understood(known: None) -> None:
     stop, params = threading.Event(), Params()
     definition = STORE.generate_msgdef(KIND, ros_version=2)[0]
     with FoxgloveServer("127.0.0.1", 0, [Channel(0, "/points", "cdr", KIND, definition)]) as server:
-        receiver = FoxgloveReceiver("127.0.0.1", server.port, frozenset({"lidar"}), params)
-        thread = threading.Thread(target=receiver, args=(Kept(params), stop))
+        receiver = FoxgloveReceiver(Kept(params), "127.0.0.1", server.port, frozenset({"lidar"}))
+        thread = threading.Thread(target=receiver, args=(stop,))
         thread.start()
         try:
             assert server.wait_for_subscribers(10.0)

@@ -9,7 +9,6 @@ from app.sensors.pointcloud import CloudLayout, read_scan
 from app.sensors.probe import PROBED_CLOUDS
 from app.sensors.ros import stamp_ns
 from app.slam.errors import HemislamError
-from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
 _GIVE_UP = 100
@@ -17,34 +16,35 @@ _GIVE_UP = 100
 
 
 class CloudReader:
-    """Examines the first clouds of a topic before it decodes any, and again if their fields change."""
+    """Examines the first clouds of a topic before it decodes any, and again if their fields change.
 
-    def __init__(self, params: Params, topic: str, kind: CloudType) -> None:
-        self._params, self._topic, self._kind = params, topic, kind
+    How clouds are read, or why they cannot be read, is reported to the intake.
+    """
+
+    def __init__(self, intake: Intake, topic: str, kind: CloudType) -> None:
+        self._intake, self._topic, self._kind = intake, topic, kind
         self._layout: CloudLayout | None = None
         self._fields: dict[str, Any] = {}
         self._waiting: list[tuple[Any, Probe, int]] = []
         self._unusable = 0
         self._reported = ""
 
-    def add(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
+    def add(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:
         """The scans that are ready after this message, each with its arrival: none at first, then all that waited.
-
-        How clouds are read, or why they cannot be read, is reported to the intake.
 
         Args:
             message: deserialised. log_ns: the time at which its sender passed it on.
         """
         try:
-            return self._read(message, log_ns, arrival_ns, intake)
+            return self._read(message, log_ns, arrival_ns)
         except HemislamError as error:
-            intake.counters.unreadable += 1
+            self._intake.counters.unreadable += 1
             if str(error) != self._reported:
                 self._reported = str(error)
-                intake.put_status("configuration", "LiDAR", self._reported)
+                self._intake.put_status("configuration", "LiDAR", self._reported)
             return []
 
-    def _read(self, message: Any, log_ns: int, arrival_ns: int, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
+    def _read(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:
         """As `add`. Raises HemislamError, with the reason, if such clouds cannot be read at all."""
         if self._layout is not None:
             cloud, scan = read_scan(message, log_ns, self._layout)
@@ -70,12 +70,12 @@ class CloudReader:
                 raise HemislamError(f"None of the clouds on {self._topic} has a usable point; check the LiDAR.")
             return [(DroppedScan(cloud.stamp_ns, "none of its points is a return"), arrival_ns)]
         self._waiting.append((message, probe, arrival_ns))
-        return self._settle(intake) if len(self._waiting) == PROBED_CLOUDS else []
+        return self._settle() if len(self._waiting) == PROBED_CLOUDS else []
 
-    def _settle(self, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
+    def _settle(self) -> list[tuple[Scan | DroppedScan, int]]:
         waiting, self._waiting = self._waiting, []
         probes = stamped([probe for _, probe, _ in waiting])
-        layout, findings = settle_cloud(probes, self._params.recording, self._topic, self._kind)
+        layout, findings = settle_cloud(probes, self._intake.params.recording, self._topic, self._kind)
         self._layout = layout
-        intake.put_findings("configuration", "LiDAR", findings)
+        self._intake.put_findings("configuration", "LiDAR", findings)
         return [(read_scan(message, probe.log_ns, layout)[1], at) for message, probe, at in waiting]

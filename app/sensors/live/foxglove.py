@@ -21,7 +21,6 @@ from app.sensors.live.cloud_reader import CloudReader
 from app.sensors.live.intake import Intake
 from app.sensors.probe import usable_types
 from app.sensors.ros import ENCODINGS, Deserialiser, imu_values, ros2_type, stamp_ns
-from app.slam.params import Params
 
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 MAX_MESSAGE = 256 << 20
@@ -51,14 +50,14 @@ class FoxgloveReceiver:
     """Receives point clouds and IMU samples; connects again whenever the connection ends.
 
     Args:
-        wanted: "lidar", "imu" or both. params: topics by name, else the first of the type.
+        wanted: "lidar", "imu" or both: on the topics that the parameters name, else on the first of the type.
     """
 
-    def __init__(self, host: str, port: int, wanted: frozenset[str], params: Params) -> None:
+    def __init__(self, intake: Intake, host: str, port: int, wanted: frozenset[str]) -> None:
+        self._intake = intake
         self._url = f"ws://{f'[{host}]' if ':' in host else host}:{port}"
         self._wanted: list[Sensor] = [sensor for sensor in NAMES if sensor in wanted]
-        self._params = params
-        chosen = params.recording
+        chosen = intake.params.recording
         self._topics: dict[Sensor, str] = {"lidar": chosen.lidar_topic, "imu": chosen.imu_topic}
         self._deserialiser = Deserialiser()
         self._channels: dict[int, Channel] = {}
@@ -67,7 +66,7 @@ class FoxgloveReceiver:
         self._last_status = ""
         self._least_delay_ns = 0
 
-    def __call__(self, intake: Intake, stop: threading.Event) -> None:
+    def __call__(self, stop: threading.Event) -> None:
         connected = False
         while not stop.is_set():
             try:
@@ -75,17 +74,17 @@ class FoxgloveReceiver:
                     self._url, subprotocols=SUBPROTOCOLS, max_size=MAX_MESSAGE, compression=None, open_timeout=5.0,
                     close_timeout=1.0, max_queue=64, proxy=None,
                 ) as connection:  # fmt: skip
-                    intake.counters.reconnects += connected
+                    self._intake.counters.reconnects += connected
                     connected = True
                     self._last_status = ""
-                    intake.put_status("connected", "source", f"connected to {self._url}")
-                    self._listen(connection, intake, stop)
+                    self._intake.put_status("connected", "source", f"connected to {self._url}")
+                    self._listen(connection, stop)
             except (OSError, WebSocketException, TimeoutError) as error:
                 text = f"no connection to {self._url} ({_brief(error)}); trying again"
-                self._report("disconnected", text, intake)
+                self._report("disconnected", text)
             stop.wait(RETRY_S)
 
-    def _listen(self, connection: Connection, intake: Intake, stop: threading.Event) -> None:
+    def _listen(self, connection: Connection, stop: threading.Event) -> None:
         """One connection, until it ends."""
         self._channels, self._subscribed = {}, {}
         self._least_delay_ns = time.time_ns()
@@ -95,16 +94,16 @@ class FoxgloveReceiver:
                 message = connection.recv(timeout=0.1)
             except TimeoutError:
                 if not self._channels and time.monotonic() - begun > RETRY_S:
-                    self._report("configuration", f"{self._url} offers no topic at all; waiting for one", intake)
+                    self._report("configuration", f"{self._url} offers no topic at all; waiting for one")
                 continue
             if isinstance(message, str):
                 if self._note(message):
-                    self._subscribe(connection, intake)
+                    self._subscribe(connection)
             elif len(message) >= MESSAGE.size and message[0] == 1:
                 _, number, log_ns = MESSAGE.unpack_from(message)
                 log_ns = log_ns if log_ns < _FAR_NS else 0
                 if number in self._subscribed:
-                    self._receive(*self._subscribed[number], message[MESSAGE.size :], log_ns, intake)
+                    self._receive(*self._subscribed[number], message[MESSAGE.size :], log_ns)
 
     def _note(self, text: str) -> bool:
         """Note channels that come and go. Returns whether any did."""
@@ -126,7 +125,7 @@ class FoxgloveReceiver:
             return False
         return operation in ("advertise", "unadvertise")
 
-    def _subscribe(self, connection: Connection, intake: Intake) -> None:
+    def _subscribe(self, connection: Connection) -> None:
         """Subscribe to wanted channels that are not subscribed yet. A subscription has its channel's number."""
         missing = []
         for sensor in self._wanted:
@@ -146,29 +145,29 @@ class FoxgloveReceiver:
             connection.send(json.dumps(request))
             others = [c.topic for c in usable if c is not found]
             hint = f"; there are also {', '.join(others)}" if others and not wanted else ""
-            intake.put_status("connected", NAMES[sensor], f"{NAMES[sensor]} on {found.topic}{hint}")
+            self._intake.put_status("connected", NAMES[sensor], f"{NAMES[sensor]} on {found.topic}{hint}")
             if sensor == "lidar":
-                self._reader = CloudReader(self._params, found.topic, CLOUD_TYPES[found.type])
-                intake.sensor = f"{found.topic} from {self._url}"
+                self._reader = CloudReader(self._intake, found.topic, CLOUD_TYPES[found.type])
+                self._intake.sensor = f"{found.topic} from {self._url}"
         if missing:
-            self._report("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it", intake)
+            self._report("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it")
 
-    def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int, intake: Intake) -> None:
+    def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int) -> None:
         arrival = self._arrival(log_ns)
         try:
             message = self._deserialiser.read(data, channel.type, channel.encoding)
         except Exception:  # rosbags lets errors of struct, numpy and assert pass
-            intake.counters.unreadable += 1
+            self._intake.counters.unreadable += 1
             return
         if sensor == "imu":
-            intake.counters.imu += 1
-            intake.put_imu(stamp_ns(message.header.stamp) or log_ns, *imu_values(message), arrival)
+            self._intake.counters.imu += 1
+            self._intake.put_imu(stamp_ns(message.header.stamp) or log_ns, *imu_values(message), arrival)
             return
-        intake.counters.packets += 1
+        self._intake.counters.packets += 1
         assert self._reader is not None
-        for scan, arrival_ns in self._reader.add(message, log_ns, arrival, intake):
-            intake.counters.frames += 1
-            intake.put_scan(scan, arrival_ns)
+        for scan, arrival_ns in self._reader.add(message, log_ns, arrival):
+            self._intake.counters.frames += 1
+            self._intake.put_scan(scan, arrival_ns)
 
     def _arrival(self, log_ns: int) -> int:
         """The arrival of a message by the host's clock, corrected for the network's varying delay.
@@ -183,11 +182,11 @@ class FoxgloveReceiver:
         arrival = log_ns + self._least_delay_ns
         return arrival if now - arrival < _MOST_DELAY_NS else now
 
-    def _report(self, kind: Literal["disconnected", "configuration"], text: str, intake: Intake) -> None:
+    def _report(self, kind: Literal["disconnected", "configuration"], text: str) -> None:
         """Put news into the intake, but only once, however often it happens."""
         if text != self._last_status:
             self._last_status = text
-            intake.put_status(kind, "source", text)
+            self._intake.put_status(kind, "source", text)
 
 
 def _brief(error: BaseException) -> str:

@@ -76,11 +76,11 @@ class Intake:
     and whether the clocks of the two sensors agree. The log time of an entry is the time of its arrival.
 
     Attributes:
-        counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
+        params: as given. counters: shared with the receiving threads. sensor: what the LiDAR reports about itself.
+        recorder: gets everything that comes, stamped in the engine's time. Data that the engine never gets, because no
+            sample or no scan came with it, is stamped in the sensor's own time. None: nothing is recorded.
 
     Args:
-        recorder: gets everything that comes, stamped in the engine's time. Data that the engine never gets, because no
-            sample or no scan came with it, is stamped in the sensor's own time.
         counters, settled: of an intake that this one continues.
     """
 
@@ -88,15 +88,14 @@ class Intake:
         self,
         params: Params,
         clock: Clock = "auto",
-        recorder: Recorder | None = None,
         counters: Counters | None = None,
         settled: Settled | None = None,
     ) -> None:
+        self.params = params
         self.counters = counters or Counters()
         self.sensor = ""
-        self._params = params
+        self.recorder: Recorder | None = None
         self._clock: Clock = clock
-        self._recorder = recorder
         self._changed = threading.Condition()
         self._scans: deque[Scan] = deque()
         self._rest: deque[ImuEntry | DroppedScan | Status] = deque()
@@ -124,7 +123,7 @@ class Intake:
 
     def put_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
         with self._changed:
-            stamp_ns += round(self._params.recording.imu_time_offset * 1e9)
+            stamp_ns += round(self.params.recording.imu_time_offset * 1e9)
             self._offset.add_imu(stamp_ns, arrival_ns)
             self._arrivals["IMU"].append(arrival_ns)
             self._put(ImuEntry(arrival_ns, stamp_ns, gyro, accel))
@@ -243,7 +242,7 @@ class Intake:
             return False
         probe = ImuProbe(stamps[good], stamps[good], gyro[good], accel[good])
         try:
-            self._units, findings = settle_imu(probe, self._params.recording)
+            self._units, findings = settle_imu(probe, self.params.recording)
         except HemislamError as error:
             if not self._unusable_reported:
                 self._unusable_reported = True
@@ -256,15 +255,15 @@ class Intake:
 
     def _record_unused(self, entry: ScanEntry | ImuEntry) -> None:
         """Record an entry that the reader does not get, in the sensor's own time, as the clock is not settled."""
-        if self._recorder is None:
+        if self.recorder is None:
             return
         if isinstance(entry, ImuEntry):
             if not self._units_tried:  # no scan came to do it
                 self._units_tried = True
                 self._settle_units()
-            self._recorder.add_imu(entry.stamp_ns, *self._units.apply(entry.gyro, entry.accel), entry.log_ns)
+            self.recorder.add_imu(entry.stamp_ns, *self._units.apply(entry.gyro, entry.accel), entry.log_ns)
         elif isinstance(entry.scan, Scan):
-            self._recorder.add_scan(entry.scan, entry.log_ns)
+            self.recorder.add_scan(entry.scan, entry.log_ns)
 
     def _settle_clock(self) -> None:
         offset = self._offset.seconds() or 0.0
@@ -315,8 +314,8 @@ class Intake:
     def _release_imu(self, entry: ImuEntry) -> None:
         stamp = self._mapped("IMU", entry.stamp_ns, entry.log_ns)
         gyro, accel = self._units.apply(entry.gyro, entry.accel)
-        if self._recorder is not None:
-            self._recorder.add_imu(stamp, gyro, accel, entry.log_ns)
+        if self.recorder is not None:
+            self.recorder.add_imu(stamp, gyro, accel, entry.log_ns)
         rate = math.hypot(*gyro)
         self._too_fast = self._too_fast + 1 if rate > TOO_FAST else 0
         if self._too_fast == _TOO_FAST_SAMPLES and not self._unit_reported:
@@ -331,8 +330,8 @@ class Intake:
             return
         shift = self._mapped("LiDAR", scan.end_ns, entry.log_ns) - scan.end_ns
         scan = replace(scan, stamp_ns=scan.stamp_ns + shift) if shift else scan
-        if self._recorder is not None:
-            self._recorder.add_scan(scan, entry.log_ns)
+        if self.recorder is not None:
+            self.recorder.add_scan(scan, entry.log_ns)
         self._scans.append(scan)
 
     def _mapped(self, name: Literal["LiDAR", "IMU"], stamp_ns: int, arrival_ns: int) -> int:
@@ -354,5 +353,5 @@ def _rate(times: deque[int], now: int) -> float:
     return (len(recent) - 1) * 1e9 / (recent[-1] - recent[0]) if len(recent) > 1 and recent[-1] > recent[0] else 0.0
 
 
-Receive = Callable[[Intake, threading.Event], None]
-"""Runs in a receiving thread: puts what comes into the intake until the event is set."""
+Receive = Callable[[threading.Event], None]
+"""Runs in a receiving thread: puts what comes into its intake until the event is set."""

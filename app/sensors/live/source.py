@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from app.sensors.live.intake import Intake, Receive, Settled
-from app.sensors.live.recorder import Recorder
 from app.sensors.live.status import Kind, LiveState, Status
 from app.sensors.recording import ImuEntry
 from app.sensors.sequencer import MAX_WAITING, Sequencer
-from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
 SILENCE_S = 1.0
@@ -49,14 +47,11 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         self,
         receivers: list[Receive],
         intake: Intake,
-        params: Params,
-        recorder: Recorder | None = None,
         before: Known | None = None,
     ) -> None:
-        self._intake = intake
-        self._recorder = recorder
+        self._intake, self._recorder = intake, intake.recorder
         self._recorded_before = (before and before.state.recorded) or 0
-        self._sequencer = (before and before.pairing) or Sequencer(params.imu)
+        self._sequencer = (before and before.pairing) or Sequencer(intake.params.imu)
         self._stop = threading.Event()
         self._events: deque[Event] = deque()
         self._heard_ns, self._heard_at = self._sequencer.newest_imu_ns, time.monotonic()
@@ -152,7 +147,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
 
 def _run(receive: Receive, intake: Intake, stop: threading.Event) -> None:
     try:
-        receive(intake, stop)
+        receive(stop)
     except Exception as error:  # the other threads continue; the user must know that this one does not
         intake.put_status("disconnected", "source", f"receiving ended: {type(error).__name__}: {error}")
         raise

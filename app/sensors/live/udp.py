@@ -21,7 +21,6 @@ from app.sensors.live.livox_udp import read_points
 from app.sensors.live.msop import other_sensor
 from app.sensors.robosense import Model
 from app.slam.errors import HemislamError
-from app.slam.params import Params
 from app.slam.types import DroppedScan, Scan
 
 BUFFER_BYTES = 16 << 20
@@ -97,24 +96,25 @@ class PacketReceiver:
 
     def __init__(
         self,
+        intake: Intake,
         device: Device,
         host: str,
         ports: tuple[int, ...],
-        params: Params,
         angles: ChannelAngles | None = None,
         own_imu: bool = False,
     ) -> None:
-        model = device.model
+        self._intake, model = intake, device.model
         self._decoder = Decoder(angles, model) if isinstance(model, Model) else None
-        self._clouds = CloudReader(params, device.layout.lidar_topic, CLOUD_TYPES[device.layout.kind])
+        self._clouds = CloudReader(intake, device.layout.lidar_topic, CLOUD_TYPES[device.layout.kind])
         with contextlib.ExitStack() as opened:  # closes those before a port that cannot be opened
             self._sockets = [opened.enter_context(open_socket(host, port)) for port in dict.fromkeys(ports)]
             self._opened = opened.pop_all()
         if self._decoder is not None:
             self._decoder.warm_up()
+            self._decoder.counters = intake.counters
         self._model, self._models = model, device.models
         self._own_imu = own_imu and device.has_imu
-        self._assembler, self._order = Assembler(), ImuOrder()
+        self._assembler, self._order = Assembler(intake.counters), ImuOrder(intake.counters)
         self._wait_until_ns: int | None = None
         self._device: Difop | None = None
         self._frames: deque[Revolution] = deque()
@@ -123,52 +123,49 @@ class PacketReceiver:
         self._heard_s = 0.0
         self._reported_another = self._reported_unreadable = False
 
-    def __call__(self, intake: Intake, stop: threading.Event) -> None:
-        self._assembler.counters = self._order.counters = intake.counters
-        if self._decoder is not None:
-            self._decoder.counters = intake.counters
+    def __call__(self, stop: threading.Event) -> None:
         with self._opened:
             while not stop.is_set():
                 ready, _, _ = select.select(self._sockets, [], [], 0.05)
                 now = time.time_ns()
                 for readable in ready:
                     for packet, arrival_ns, peer in _drain(readable):
-                        self._take(packet, arrival_ns, peer, intake)
+                        self._take(packet, arrival_ns, peer)
                 if not ready:
-                    self._put_imu(self._order.flush(), now, intake)
+                    self._put_imu(self._order.flush(), now)
                 since = self._assembler.pending_since()
                 if self._sockets[0] not in ready and since is not None and now - since > _REST_NS:
                     self._frames += self._assembler.flush()
-                self._give(now, intake)
+                self._give(now)
 
-    def _take(self, packet: bytes, now: int, peer: Peer, intake: Intake) -> None:
+    def _take(self, packet: bytes, now: int, peer: Peer) -> None:
         sensor, is_difop, of_imu = sensor_of(packet), packet[:8] == DIFOP_ID, is_imu(packet)
-        if (is_difop or of_imu or sensor is not None) and self._is_another(peer, is_difop or of_imu, intake):
-            intake.counters.foreign += 1
+        if (is_difop or of_imu or sensor is not None) and self._is_another(peer, is_difop or of_imu):
+            self._intake.counters.foreign += 1
         elif of_imu:
             if self._own_imu:
-                self._put_imu(self._order.add(packet), now, intake)
+                self._put_imu(self._order.add(packet), now)
         elif is_difop and isinstance(self._model, Model):
             difop = read_difop(packet, self._model)
             if difop is None:
-                intake.counters.truncated += 1
+                self._intake.counters.truncated += 1
             else:
-                intake.counters.difop += 1
-                self._configure(difop, now, intake)
+                self._intake.counters.difop += 1
+                self._configure(difop, now)
         elif sensor is None or sensor in self._models:
             self._frames += self._assembler.add(packet, now)
             if sensor is None and not self._reported_unreadable and (other := other_sensor(packet)):
                 self._reported_unreadable = True
                 text = f"{peer[0]} is {other}, whose packets are not read; take its clouds from ROS, by foxglove://"
-                intake.put_status("configuration", "LiDAR", text)
+                self._intake.put_status("configuration", "LiDAR", text)
         else:
-            intake.counters.foreign += 1
+            self._intake.counters.foreign += 1
 
-    def _put_imu(self, samples: list[ImuSample], arrival_ns: int, intake: Intake) -> None:
+    def _put_imu(self, samples: list[ImuSample], arrival_ns: int) -> None:
         for sample in samples:
-            intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)
+            self._intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)
 
-    def _is_another(self, peer: Peer, beside: bool, intake: Intake) -> bool:
+    def _is_another(self, peer: Peer, beside: bool) -> bool:
         """Whether a packet is from another sensor than the one in use, which is the first until it falls silent.
 
         Args:
@@ -181,29 +178,29 @@ class PacketReceiver:
             if not self._reported_another:
                 self._reported_another = True
                 text = f"{peer[0]} sends to the port of {current[0]} too; its packets are left out while both send"
-                intake.put_status("configuration", "LiDAR", text)
+                self._intake.put_status("configuration", "LiDAR", text)
             return True
         if not beside:
             self._sensor, self._heard_s = current, now
         return False
 
-    def _configure(self, difop: Difop, now: int, intake: Intake) -> None:
+    def _configure(self, difop: Difop, now: int) -> None:
         before, self._device = self._device, difop
         if self._decoder is None or (before is not None and before.same(difop)):
             return
         if before is not None:
-            self._give(now, intake)  # earlier packets were measured with the old settings
+            self._give(now)  # earlier packets were measured with the old settings
         self._decoder.configure(difop)
         self._assembler.turn_ns = round(60e9 / difop.rpm)
-        intake.sensor = f"{self._model.name} {difop.serial}: {difop.describe()}"
+        self._intake.sensor = f"{self._model.name} {difop.serial}: {difop.describe()}"
         if before is not None:
-            intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {difop.describe()}")
+            self._intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {difop.describe()}")
             return
-        intake.put_status("connected", "LiDAR", intake.sensor)
+        self._intake.put_status("connected", "LiDAR", self._intake.sensor)
         if difop.T_imu_lidar is not None:
-            intake.put_status("configuration", "LiDAR", mount_finding(difop.T_imu_lidar).text)
+            self._intake.put_status("configuration", "LiDAR", mount_finding(difop.T_imu_lidar).text)
 
-    def _give(self, now: int, intake: Intake) -> None:
+    def _give(self, now: int) -> None:
         """Decode and hand on; at the start, once the angles are known or their time is up."""
         if not self._frames:
             return
@@ -213,35 +210,35 @@ class PacketReceiver:
                 return
             self._angles_settled = True
             text = "no DIFOP packet came with this unit's angles; the nominal ones are used until one comes"
-            intake.put_status("configuration", "LiDAR", text)
+            self._intake.put_status("configuration", "LiDAR", text)
         while self._frames:
             frame = self._frames.popleft()
-            for scan, arrival_ns in self._scans(frame, intake):
-                intake.put_scan(scan, arrival_ns)
-                if isinstance(scan, Scan) and not intake.sensor:
+            for scan, arrival_ns in self._scans(frame):
+                self._intake.put_scan(scan, arrival_ns)
+                if isinstance(scan, Scan) and not self._intake.sensor:
                     without = "" if self._decoder is None else ", without device packets"
-                    intake.sensor = f"{frame.model.name}{without}"
+                    self._intake.sensor = f"{frame.model.name}{without}"
 
-    def _scans(self, frame: Revolution, intake: Intake) -> list[tuple[Scan | DroppedScan, int]]:
+    def _scans(self, frame: Revolution) -> list[tuple[Scan | DroppedScan, int]]:
         """The scans that can be given now, each with its arrival."""
         if self._decoder is None:
-            return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns, intake)
+            return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns)
         return [(self._decoder.decode(frame), frame.arrival_ns)]
 
 
 class ImuReceiver:
     """Receives IMU samples (see `imu_udp.py`). Raises HemislamError: the port cannot be opened."""
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, intake: Intake, host: str, port: int) -> None:
+        self._intake = intake
         self._socket = open_socket(host, port)
-        self._order = ImuOrder()
+        self._order = ImuOrder(intake.counters)
 
-    def __call__(self, intake: Intake, stop: threading.Event) -> None:
-        self._order.counters = intake.counters
+    def __call__(self, stop: threading.Event) -> None:
         with self._socket:
             while not stop.is_set():
                 ready, _, _ = select.select([self._socket], [], [], 0.05)
                 samples = [(s, at) for datagram, at, _ in _drain(self._socket) for s in self._order.add(datagram)]
                 samples = samples or [(s, time.time_ns()) for s in ([] if ready else self._order.flush())]
                 for sample, arrival_ns in samples:
-                    intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)
+                    self._intake.put_imu(sample.stamp_ns, sample.gyro, sample.accel, arrival_ns)

@@ -128,12 +128,14 @@ def open_live(
             "An RS-Bpearl's packets hold no IMU samples; say where those come from, e.g. --imu imu-udp://:6700."
         )
     angles = read_angles(Path(address.options["angles"])) if "angles" in address.options else None
+    clock = cast(Clock, address.options.get("clock", "auto"))
+    intake = Intake(params, clock, *((before.state.counters, before.settled) if before else ()))
     receivers: list[Receive] = []
     if beside is not None and beside.scheme == "imu-udp":
-        receivers.append(ImuReceiver(beside.host or "0.0.0.0", beside.ports[0]))
+        receivers.append(ImuReceiver(intake, beside.host or "0.0.0.0", beside.ports[0]))
     if device is not None:
         receivers.append(
-            PacketReceiver(device, address.host or "0.0.0.0", address.ports, params, angles, own_imu=beside is None)
+            PacketReceiver(intake, device, address.host or "0.0.0.0", address.ports, angles, own_imu=beside is None)
         )
     # One connection to each Foxglove server, for all topics wanted from it.
     wanted: dict[tuple[str, int], frozenset[str]] = {}
@@ -141,8 +143,6 @@ def open_live(
         if source is not None and source.scheme == "foxglove":
             at = (source.host or "127.0.0.1", source.ports[0])
             wanted[at] = wanted.get(at, frozenset()) | sensors
-    receivers += [FoxgloveReceiver(*at, sensors, params) for at, sensors in wanted.items()]
-    recorder = Recorder(record) if record else None
-    clock = cast(Clock, address.options.get("clock", "auto"))
-    known = (before.state.counters, before.settled) if before else ()
-    return LiveSource(receivers, Intake(params, clock, recorder, *known), params, recorder, before)
+    receivers += [FoxgloveReceiver(intake, *at, sensors) for at, sensors in wanted.items()]
+    intake.recorder = Recorder(record) if record else None
+    return LiveSource(receivers, intake, before)

@@ -177,8 +177,8 @@ def test_a_scan_of_a_mid360_ends_with_each_tenth_of_a_second() -> None:
 def received(scheme: str, packets: list[bytes], wanted: Callable[[Intake], bool]) -> Intake:
     """What a receiver makes of packets that come by UDP, once it has what is wanted, or after ten seconds."""
     (port,), intake, stop = ports.free(1), Intake(Params()), threading.Event()
-    receiver = PacketReceiver(DEVICES[scheme], "127.0.0.1", (port,), Params(), own_imu=True)
-    thread = threading.Thread(target=receiver, args=(intake, stop))
+    receiver = PacketReceiver(intake, DEVICES[scheme], "127.0.0.1", (port,), own_imu=True)
+    thread = threading.Thread(target=receiver, args=(stop,))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for packet in packets:
             sender.sendto(packet, ("127.0.0.1", port))
@@ -235,8 +235,8 @@ def test_the_last_points_before_a_silence_are_given_while_the_imu_goes_on(monkey
     really = select.select
     monkeypatch.setattr(select, "select", lambda of, *_: (really(of, [], [], 0.01)[0] or [of[1]], [], []))  # the IMU
     numbers, intake, stop = ports.free(2), Intake(Params()), threading.Event()
-    receiver = PacketReceiver(DEVICES["mid360"], "127.0.0.1", tuple(numbers), Params(), own_imu=True)
-    thread = threading.Thread(target=receiver, args=(intake, stop))
+    receiver = PacketReceiver(intake, DEVICES["mid360"], "127.0.0.1", tuple(numbers), own_imu=True)
+    thread = threading.Thread(target=receiver, args=(stop,))
     thread.start()
     body = struct.pack("<3iBB", 1000, 0, 0, 1, 16) * 96
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

@@ -141,13 +141,13 @@ def test_clouds_that_contradict_themselves_are_reported_and_take_no_memory() -> 
     """Billions of points of no bytes each once took all there is."""
     luck, intake = random.Random(0), Intake(Params())
     for _ in range(60):
-        reader = CloudReader(Params(), "/points", POINT_CLOUD_2)
+        reader = CloudReader(intake, "/points", POINT_CLOUD_2)
         for number in range(30):
-            arrived = reader.add(_odd_cloud(luck, number), sensor.START_NS, sensor.START_NS, intake)
+            arrived = reader.add(_odd_cloud(luck, number), sensor.START_NS, sensor.START_NS)
             assert all(isinstance(scan, DroppedScan) or len(scan) <= 2400 for scan, _ in arrived)
     nothing = ros.cloud_message(Scan(0, np.ones((5, 3), np.float32), *(np.zeros(5, k) for k in ("i4", "f4", "u2"))))
     nothing.point_step, nothing.width = 0, 2_000_000_000
-    ((scan, _),) = CloudReader(Params(), "/points", POINT_CLOUD_2).add(nothing, 0, 0, intake)
+    ((scan, _),) = CloudReader(intake, "/points", POINT_CLOUD_2).add(nothing, 0, 0)
     assert isinstance(scan, DroppedScan) and "of 0 bytes" in scan.reason
 
 

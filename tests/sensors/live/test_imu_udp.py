@@ -71,9 +71,9 @@ def test_the_documented_sender_is_understood() -> None:
     text = re.search(r"A complete sender:\n\n```python\n(.+?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
     assert text is not None
     (port,) = ports.free(1)
-    receiver = ImuReceiver("127.0.0.1", port)
     intake, stop = Intake(Params()), threading.Event()
-    thread = threading.Thread(target=receiver, args=(intake, stop))
+    receiver = ImuReceiver(intake, "127.0.0.1", port)
+    thread = threading.Thread(target=receiver, args=(stop,))
     thread.start()
     script = text[1].replace("6700", str(port))
     sender = subprocess.Popen([sys.executable, "-c", script])

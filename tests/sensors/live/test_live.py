@@ -31,7 +31,7 @@ class Rig:
 
     def __init__(self, params: Params | None = None) -> None:
         self.intake = Intake(params or Params())
-        self.source = LiveSource([], self.intake, params or Params())
+        self.source = LiveSource([], self.intake)
         self.lidar_ns = self.imu_ns = sensor.START_NS
         self.now = time.time_ns()
         self.accel = (0.0, 0.0, 9.81)

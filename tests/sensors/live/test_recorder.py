@@ -78,8 +78,9 @@ def test_a_session_reads_again_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize("imu_from", [None, 13])
 def test_scans_that_no_sample_covers_are_recorded_too(tmp_path: Path, imu_from: int | None) -> None:
     recorder = Recorder(tmp_path / "session.mcap")
-    intake = Intake(Params(), recorder=recorder)
-    with LiveSource([], intake, Params(), recorder):
+    intake = Intake(Params())
+    intake.recorder = recorder
+    with LiveSource([], intake):
         for turn in range(150):
             if imu_from is not None and turn >= imu_from * 10:
                 put_samples(intake, turn, 9.81)
@@ -93,8 +94,9 @@ def test_scans_that_no_sample_covers_are_recorded_too(tmp_path: Path, imu_from: 
 
 def test_samples_of_an_imu_that_waits_long_for_the_lidar_are_recorded_in_one_unit(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "session.mcap")
-    intake = Intake(Params(), recorder=recorder)
-    with LiveSource([], intake, Params(), recorder):
+    intake = Intake(Params())
+    intake.recorder = recorder
+    with LiveSource([], intake):
         for turn in range(150):
             put_samples(intake, turn, 1.0)
             if turn >= 130:
