@@ -26,7 +26,7 @@ class McapStream:
 
     Attributes:
         counts: topic -> (type as in ROS 2, number of messages). start_ns, end_ns: log times.
-        cut: the pieces without an end, in order of time.
+        pieces: as given, in order of time. cut: those without an end.
         set_back: (number of a message, ns): where the recorder's clock was set back, and by how much. From there on,
             this is added to log times, so that they are continuous.
         sorted: whether log times never step back, not even by a little.
@@ -41,7 +41,7 @@ class McapStream:
         self.counts: dict[str, tuple[str, int]] = {}
         self.cut: list[Path] = []
         self.set_back: list[tuple[int, int]] = []
-        self._pieces = sorted(pieces, key=self._begin)
+        self.pieces = sorted(pieces, key=self._begin)
         first_ns, last_ns, added_ns = 0, 0, 0
         last: dict[str, int] = {}
         topics, times = list[str](), array("q")
@@ -75,7 +75,7 @@ class McapStream:
             log_ns = self._better.get(number, log_ns)
             if topic in topics and start_ns <= log_ns + added_ns < stop_ns:
                 yield topic, log_ns + added_ns, self._deserialiser.read(data, kind, encoding)
-        if self._pieces[-1] in self.cut and stop_ns > self.end_ns:
+        if self.pieces[-1] in self.cut and stop_ns > self.end_ns:
             raise EndOfFile("the file ends here, in the middle of a record")
 
     def close(self) -> None:
@@ -87,7 +87,7 @@ class McapStream:
         return first[len(first) // 2] if first else 0
 
     def _all_records(self) -> Iterator[tuple[str, str, int, str, bytes]]:
-        for piece in self._pieces:
+        for piece in self.pieces:
             yield from self._records_of(piece)
 
     def _records_of(self, piece: Path) -> Iterator[tuple[str, str, int, str, bytes]]:

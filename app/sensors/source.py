@@ -153,12 +153,12 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
     try:
         reader, found = _read_by_rosbags(path, files)
     except Exception as error:  # as above
-        salvaged = _salvage(path, files, _brief(error))
-        if salvaged is None:
+        if (salvaged := _front_to_back(path, files)) is None:
             raise HemislamError(_refusal(path, error)) from error
-        return salvaged
+        return salvaged, (_salvage_finding(salvaged, _brief(error)),)
     unindexed = reader.is_unindexed()
-    if (unindexed or reader.may_be_disordered()) and (in_order := _in_file_order(path, files, always=unindexed)):
+    in_order = _front_to_back(path, files) if unindexed or reader.may_be_disordered() else None
+    if in_order and (unindexed or in_order.wild or not in_order.sorted):
         reader.close()
         wrong = "it has no index of its messages" if unindexed else "log times in it are wrong"
         why = "the recorder's clock was set back while recording" if in_order.set_back else wrong
@@ -187,9 +187,9 @@ def _read_by_rosbags(path: Path, files: list[Path]) -> tuple[RosbagsStream, tupl
             return stream, ()
     except Exception as error:
         stream, why = error, _brief(error)
-    inside = (sorted(path.glob("*.mcap")) or sorted(path.glob("*.db3"))) if files == [path] and path.is_dir() else []
+    inside = _single_files(path, files)
     with suppress(Exception):
-        if inside and not (bare := RosbagsStream(inside)).is_packed():
+        if inside not in ([], files) and not (bare := RosbagsStream(inside)).is_packed():
             text = f"the folder's metadata.yaml cannot be used ({why}); its {len(inside)} file(s) were read without it"
             if isinstance(stream, RosbagsStream):
                 stream.close()
@@ -220,37 +220,27 @@ def _write_ahead_logs(path: Path) -> list[Path]:
     return [wal for wal in found if is_file(wal) and wal.stat().st_size]
 
 
-def _in_file_order(path: Path, files: list[Path], *, always: bool) -> McapStream | None:
-    """The files of an MCAP read from front to back, if log times are wrong or step back on the way, or always."""
-    try:
-        stream = McapStream(sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files)
-    except Exception:  # whatever a damaged file may cause; rosbags reads it
-        return None
-    return stream if stream.counts and (always or stream.wild or not stream.sorted) else None
-
-
-def _salvage(path: Path, files: list[Path], why: str) -> tuple[Stream, tuple[Finding, ...]] | None:
+def _front_to_back(path: Path, files: list[Path]) -> McapStream | None:
     """MCAP files read from front to back, if that yields anything."""
-    pieces = sorted(path.glob("*.mcap")) if files == [path] and path.is_dir() else files
-    if not pieces or any(piece.suffix.lower() != ".mcap" for piece in pieces):
-        return None
+    pieces = _single_files(path, files)
     try:
-        stream = McapStream(pieces)
-    except Exception:  # whatever a damaged file may cause: the first error is the one to report
+        stream = McapStream(pieces) if {piece.suffix.lower() for piece in pieces} == {".mcap"} else None
+    except Exception:  # whatever a damaged file may cause; then it is as rosbags says
         return None
-    if not stream.counts:
-        return None
+    return stream if stream and stream.counts else None
+
+
+def _salvage_finding(stream: McapStream, why: str) -> Finding:
     if not stream.cut:
-        return stream, (
-            Finding("file", "corrected", f"read from front to back, since its index cannot be used ({why})"),
-        )
-    if len(pieces) == 1:
+        return Finding("file", "corrected", f"read from front to back, since its index cannot be used ({why})")
+    if len(stream.pieces) == 1:
         length = (stream.end_ns - stream.start_ns) / 1e9
         text = f"the file is cut off {length:.1f} s after its start ({why}); what comes before is used"
     else:
         names = ", ".join(piece.name for piece in stream.cut)
-        text = f"{len(stream.cut)} of {len(pieces)} files cut off ({names}: {why}); what they hold before that is used"
-    return stream, (Finding("file", "needs you", text),)
+        cut = f"{len(stream.cut)} of {len(stream.pieces)} files cut off ({names}: {why})"
+        text = f"{cut}; what they hold before that is used"
+    return Finding("file", "needs you", text)
 
 
 def _refusal(path: Path, error: Exception) -> str:
@@ -306,9 +296,8 @@ def _recording_files(path: Path) -> list[Path]:
 def _folder_files(path: Path) -> list[Path]:
     if (path / "metadata.yaml").is_file():
         return [path]
-    for suffix in (".mcap", ".db3"):
-        if files := sorted(path.glob(f"*{suffix}")):
-            return files
+    if files := _ros2_files(path):
+        return files
     bags = sorted(path.glob("*.bag"))
     if pieces := _pieces(bags):
         return pieces
@@ -318,6 +307,15 @@ def _folder_files(path: Path) -> list[Path]:
     elif compressed := sorted(file for file in path.iterdir() if file.suffix in _COMPRESSED):
         hint = f"copy its metadata.yaml too, or unpack its files, as by `unzstd {quoted(compressed[0])}`"
     raise HemislamError(f"The folder {path} is not a ROS 2 recording (it has neither metadata.yaml nor .mcap); {hint}.")
+
+
+def _ros2_files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.mcap")) or sorted(folder.glob("*.db3"))
+
+
+def _single_files(path: Path, files: list[Path]) -> list[Path]:
+    """The files in a folder that rosbags reads by its metadata.yaml; else the files as given."""
+    return _ros2_files(path) if files == [path] and path.is_dir() else files
 
 
 def _pieces(bags: list[Path]) -> list[Path]:
