@@ -13,7 +13,7 @@ FEW = 20
 SET_BACK_NS = 500_000_000
 """If log times on one topic step back by more, the recorder's clock was set."""
 LATEST_NS = 2**62
-"""The year 2116; later log times are cut to it, so that integers hold their differences."""
+"""The year 2116; later times are left out or cut to it, so that integers hold their differences."""
 _REACH = 10
 """A log time is compared with this many before it and as many after it."""
 

@@ -19,6 +19,7 @@ from app.sensors.imu_units import STANDARD_GRAVITY
 from app.sensors.live.capture import PacketStream
 from app.sensors.live.devices import mount_finding
 from app.sensors.live.pcap import Datagram
+from app.sensors.log_times import LATEST_NS
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64, I64, U8
@@ -297,7 +298,7 @@ def _imu_message(packet: bytes) -> Any:
     (sample,) = np.frombuffer(packet, _IMU)
     with np.errstate(invalid="ignore"):
         gyro, accel = np.radians(sample["gyro"].astype(np.float64)), sample["accel"].astype(np.float64)
-    stamp_ns = min(int(sample["gyro_ns"]), 1 << 62)
+    stamp_ns = min(int(sample["gyro_ns"]), LATEST_NS)
     return ros.imu_message(stamp_ns, tuple(gyro.tolist()), tuple((accel * STANDARD_GRAVITY).tolist()))
 
 

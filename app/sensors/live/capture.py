@@ -29,6 +29,7 @@ from app.sensors.live.livox_udp import read_points
 from app.sensors.live.msop import other_sensor
 from app.sensors.live.pcap import Capture, CapturePlace, Datagram
 from app.sensors.live.status import Counters
+from app.sensors.log_times import LATEST_NS
 from app.sensors.robosense import Model
 from app.slam.errors import HemislamError, quoted
 from app.slam.text_files import is_file
@@ -41,9 +42,6 @@ that decide whether two clocks agree."""
 _RUN_IN = 2
 """Reading begins at the place where the scan this many earlier was complete, which is before all packets of the wanted
 scan."""
-
-_FAR_NS = 1 << 62
-"""The year 2116; later stamps are limited to it, so that integers can hold them."""
 
 _WILD_NS = 10_000_000_000
 """A log time that is farther than this from those around it is wrong."""
@@ -331,4 +329,4 @@ def _value_at(rows: list[tuple[int, V]], log_ns: int) -> V:
 
 
 def _bounded(ns: int) -> int:
-    return max(-_FAR_NS, min(ns, _FAR_NS))
+    return max(-LATEST_NS, min(ns, LATEST_NS))

@@ -19,6 +19,7 @@ from websockets.typing import Subprotocol
 from app.sensors.cloud_types import CLOUD_TYPES
 from app.sensors.live.cloud_reader import CloudReader
 from app.sensors.live.intake import Intake
+from app.sensors.log_times import LATEST_NS
 from app.sensors.probe import usable_types
 from app.sensors.ros import ENCODINGS, Deserialiser, imu_values, ros2_type, stamp_ns
 
@@ -27,8 +28,6 @@ MAX_MESSAGE = 256 << 20
 RETRY_S = 1.0
 _MOST_DELAY_NS = 800_000_000
 """Largest delay of a network; older log times are not trusted."""
-_FAR_NS = 1 << 62
-"""The year 2116; a later log time is ignored."""
 MESSAGE = struct.Struct("<BIQ")
 
 Sensor = Literal["lidar", "imu"]
@@ -101,7 +100,7 @@ class FoxgloveReceiver:
                     self._subscribe(connection)
             elif len(message) >= MESSAGE.size and message[0] == 1:
                 _, number, log_ns = MESSAGE.unpack_from(message)
-                log_ns = log_ns if log_ns < _FAR_NS else 0
+                log_ns = log_ns if log_ns < LATEST_NS else 0
                 if number in self._subscribed:
                     self._receive(*self._subscribed[number], message[MESSAGE.size :], log_ns)
 

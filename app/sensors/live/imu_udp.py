@@ -22,14 +22,13 @@ from app.sensors.imu_units import STANDARD_GRAVITY
 from app.sensors.live import livox_udp
 from app.sensors.live.msop import read_utc, utc_bytes
 from app.sensors.live.status import Counters
+from app.sensors.log_times import LATEST_NS
 from app.slam.types import Vector
 
 IMU_PORT = 6700
 IMU_MAGIC = b"HIMU"
 _SAMPLE = struct.Struct("<4sIq6d")
 SAMPLE_BYTES = _SAMPLE.size
-_FAR_NS = 1 << 62
-"""The year 2116; later times would overflow."""
 AIRY_IMU_PORT = 6688
 _AIRY_MAGIC = bytes.fromhex("aa555a05")
 _AIRY_SAMPLE = struct.Struct(">4s10s6i4xBBBI2s")
@@ -81,7 +80,7 @@ def read_imu(datagram: bytes) -> list[ImuSample]:
         return []
     samples = []
     for magic, number, stamp, gx, gy, gz, ax, ay, az in _SAMPLE.iter_unpack(datagram):
-        if magic != IMU_MAGIC or abs(stamp) >= _FAR_NS:
+        if magic != IMU_MAGIC or abs(stamp) >= LATEST_NS:
             return []
         samples.append(ImuSample(number, stamp, (gx, gy, gz), (ax, ay, az)))
     return samples
@@ -92,7 +91,7 @@ def _read_airy(datagram: bytes) -> list[ImuSample]:
         return []
     _, time, ax, ay, az, gx, gy, gz, _, accel_range, gyro_range, number, _ = _AIRY_SAMPLE.unpack(datagram)
     stamp_ns = read_utc(time)
-    if stamp_ns is None or stamp_ns >= _FAR_NS or max(accel_range, gyro_range) > 3:
+    if stamp_ns is None or stamp_ns >= LATEST_NS or max(accel_range, gyro_range) > 3:
         return []
     accel, gyro = _airy_units(accel_range, gyro_range)
     return [ImuSample(number, stamp_ns, (gx * gyro, gy * gyro, gz * gyro), (ax * accel, ay * accel, az * accel))]

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from app.sensors.imu_units import STANDARD_GRAVITY
 from app.sensors.livox import CustomMsg
+from app.sensors.log_times import LATEST_NS
 from app.slam.errors import HemislamError
 from app.slam.types import I64, U8, Scan, Vector
 
@@ -37,7 +38,6 @@ _MEASURED: dict[int, tuple[np.dtype[Any], float]] = {
     2: (np.dtype([("at", "<i2", 3), ("reflectivity", "u1"), ("tag", "u1")]), 0.01),
 }
 """Layout of a point and m of its unit, by the kind of content."""
-_FAR_NS = 1 << 62
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +66,7 @@ def read_header(packet: bytes) -> LivoxHeader | None:
         return None
     version, length, _, count, number, _, kind, _, _, stamp = _HEADER.unpack_from(packet)
     size = _SAMPLE.size if kind == _IMU_KIND else _MEASURED[kind][0].itemsize if kind in _MEASURED else -1
-    if version or length != len(packet) or not count or HEADER_BYTES + count * size != length or stamp >= _FAR_NS:
+    if version or length != len(packet) or not count or HEADER_BYTES + count * size != length or stamp >= LATEST_NS:
         return None
     return LivoxHeader(number, kind == _IMU_KIND, stamp)
 

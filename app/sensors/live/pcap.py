@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from io import BufferedReader
 from pathlib import Path
 
+from app.sensors.log_times import LATEST_NS
+
 CLASSIC_MAGIC = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 NEXT_MAGIC = b"\x0a\x0d\x0d\x0a"
 MAX_RECORD = 1 << 22
-_FAR_NS = 1 << 62
 _MOST_INTERFACES = 1024
 """Most interfaces of a section; packets of further interfaces are ignored."""
 _FRAGMENTS_KEPT = 64
@@ -90,7 +91,7 @@ class Capture:
             try:
                 for at, time_ns, link, frame in self._frames(file, place):
                     packet = _ip_packet(link, frame)
-                    if packet and 0 <= time_ns < _FAR_NS:
+                    if packet and 0 <= time_ns < LATEST_NS:
                         payload = _udp_payload(packet, waiting)
                         if payload is not None:
                             sender = packet[12:16] if packet[0] >> 4 == 4 else packet[8:24]
