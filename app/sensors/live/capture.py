@@ -201,7 +201,7 @@ class CaptureStream(PacketStream):
 
     def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[Revolution | ImuSample | Difop]:
         counters = self._counters = Counters()
-        assembler, order, model = Assembler(counters), ImuOrder(counters), self._device.model
+        assembler, order, model = Assembler(counters, self._device.models), ImuOrder(counters), self._device.model
         for log_ns, datagram in datagrams:
             payload = datagram.payload
             beside = payload.startswith(IMU_MAGIC)
@@ -221,10 +221,8 @@ class CaptureStream(PacketStream):
                 if isinstance(model, Model) and (difop := read_difop(payload, model)) is not None:
                     counters.difop += 1
                     yield difop
-            elif (sensor := sensor_of(payload)) is None or sensor in self._device.models:
-                yield from assembler.add(payload, log_ns)
             else:
-                counters.foreign += 1
+                yield from assembler.add(payload, log_ns)
         yield from assembler.flush()
         yield from order.flush()
 

@@ -79,11 +79,15 @@ class Assembler:
 
     Attributes:
         counters: of what happened. turn_ns: duration of a revolution, as the device states it.
+
+    Args:
+        models: whose packets are used; (): of every sensor.
     """
 
-    def __init__(self, counters: Counters | None = None) -> None:
+    def __init__(self, counters: Counters | None = None, models: tuple[Model | Livox, ...] = ()) -> None:
         self.counters = counters if counters is not None else Counters()
         self.turn_ns = 100_000_000
+        self._models = models
         self._pending: list[Pending] = []
         self._model: Model | Livox | None = None
         self._first = 0
@@ -96,7 +100,7 @@ class Assembler:
     def add(self, packet: bytes, arrival_ns: int) -> list[Revolution]:
         """Revolutions that this packet completes, mostly none. arrival_ns: by the host's clock."""
         head = _read(packet)
-        if head is None:
+        if head is None or (self._models and head.sensor not in self._models):
             if msop.is_cut(packet):
                 self.counters.truncated += 1
             else:

@@ -112,9 +112,9 @@ class PacketReceiver:
         if self._decoder is not None:
             self._decoder.warm_up()
             self._decoder.counters = intake.counters
-        self._model, self._models = model, device.models
+        self._model = model
         self._own_imu = own_imu and device.has_imu
-        self._assembler, self._order = Assembler(intake.counters), ImuOrder(intake.counters)
+        self._assembler, self._order = Assembler(intake.counters, device.models), ImuOrder(intake.counters)
         self._wait_until_ns: int | None = None
         self._device: Difop | None = None
         self._frames: deque[Revolution] = deque()
@@ -152,14 +152,12 @@ class PacketReceiver:
             else:
                 self._intake.counters.difop += 1
                 self._configure(difop, now)
-        elif sensor is None or sensor in self._models:
+        else:
             self._frames += self._assembler.add(packet, now)
             if sensor is None and not self._reported_unreadable and (other := other_sensor(packet)):
                 self._reported_unreadable = True
                 text = f"{peer[0]} is {other}, whose packets are not read; take its clouds from ROS, by foxglove://"
                 self._intake.put_status("configuration", "LiDAR", text)
-        else:
-            self._intake.counters.foreign += 1
 
     def _put_imu(self, samples: list[ImuSample], arrival_ns: int) -> None:
         for sample in samples:
