@@ -261,9 +261,8 @@ class Intake:
             if not self._units_tried:  # no scan came to do it
                 self._units_tried = True
                 self._settle_units()
-            self.recorder.add_imu(entry.stamp_ns, *self._units.apply(entry.gyro, entry.accel), entry.log_ns)
-        elif isinstance(entry.scan, Scan):
-            self.recorder.add_scan(entry.scan, entry.log_ns)
+            entry = ImuEntry(entry.log_ns, entry.stamp_ns, *self._units.apply(entry.gyro, entry.accel))
+        self.recorder.add(entry)
 
     def _settle_clock(self) -> None:
         offset = self._offset.seconds() or 0.0
@@ -313,15 +312,15 @@ class Intake:
 
     def _release_imu(self, entry: ImuEntry) -> None:
         stamp = self._mapped("IMU", entry.stamp_ns, entry.log_ns)
-        gyro, accel = self._units.apply(entry.gyro, entry.accel)
+        entry = ImuEntry(entry.log_ns, stamp, *self._units.apply(entry.gyro, entry.accel))
         if self.recorder is not None:
-            self.recorder.add_imu(stamp, gyro, accel, entry.log_ns)
-        rate = math.hypot(*gyro)
+            self.recorder.add(entry)
+        rate = math.hypot(*entry.gyro)
         self._too_fast = self._too_fast + 1 if rate > TOO_FAST else 0
         if self._too_fast == _TOO_FAST_SAMPLES and not self._unit_reported:
             self._unit_reported = True
             self.put_findings("units", "IMU", [too_fast(rate)])
-        self._rest.append(ImuEntry(entry.log_ns, stamp, gyro, accel))
+        self._rest.append(entry)
 
     def _release_scan(self, entry: ScanEntry) -> None:
         scan = entry.scan
@@ -331,7 +330,7 @@ class Intake:
         shift = self._mapped("LiDAR", scan.end_ns, entry.log_ns) - scan.end_ns
         scan = replace(scan, stamp_ns=scan.stamp_ns + shift) if shift else scan
         if self.recorder is not None:
-            self.recorder.add_scan(scan, entry.log_ns)
+            self.recorder.add(replace(entry, scan=scan))
         self._scans.append(scan)
 
     def _mapped(self, name: Literal["LiDAR", "IMU"], stamp_ns: int, arrival_ns: int) -> int:

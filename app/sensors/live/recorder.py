@@ -10,16 +10,14 @@ import threading
 from collections import deque
 from pathlib import Path
 
+from app.sensors.recording import ImuEntry, ScanEntry
 from app.sensors.ros import RecordingWriter
 from app.slam.errors import HemislamError
-from app.slam.types import Scan, Vector
+from app.slam.types import Scan
 
 FLUSH_S = 0.5
 MAX_SCANS, MAX_SAMPLES = 200, 100_000
 """Most messages that wait for the disk: 20 s of scans. If the disk is too slow, the newest are left out."""
-
-_Scan = tuple[Scan, int]
-_Imu = tuple[int, Vector, Vector, int]
 
 
 class Recorder:
@@ -44,35 +42,27 @@ class Recorder:
                 raise HemislamError(f"{path} is there already; record into another file.") from None
             raise HemislamError(f"{path} cannot be written ({error.strerror}); choose another place.") from None
         self._mcap = RecordingWriter(self._file)
-        self._waiting: deque[_Scan | _Imu] = deque()
+        self._waiting: deque[ScanEntry | ImuEntry] = deque()
         self._scans_waiting = 0
         self._wake = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._run, daemon=True, name="recorder")
         self._thread.start()
 
-    def add_scan(self, scan: Scan, arrival_ns: int) -> None:
-        if self._scans_waiting >= MAX_SCANS:
+    def add(self, entry: ScanEntry | ImuEntry) -> None:
+        """Queue a message to be written, if there is room. A scan that was dropped is not written."""
+        is_scan = isinstance(entry, ScanEntry)
+        if self.failure or len(self._waiting) >= MAX_SAMPLES or (is_scan and self._scans_waiting >= MAX_SCANS):
             self.left_out += 1
-        elif self._add((scan, arrival_ns)):
-            self._scans_waiting += 1
-
-    def add_imu(self, stamp_ns: int, gyro: Vector, accel: Vector, arrival_ns: int) -> None:
-        self._add((stamp_ns, gyro, accel, arrival_ns))
+            return
+        self._scans_waiting += is_scan
+        self._waiting.append(entry)
 
     def close(self) -> None:
         """Write the waiting messages and the end of the file."""
         self._closing = True
         self._wake.set()
         self._thread.join(30.0)
-
-    def _add(self, message: _Scan | _Imu) -> bool:
-        """Queue a message. Returns whether it will be written."""
-        if len(self._waiting) >= MAX_SAMPLES or self.failure:
-            self.left_out += 1
-            return False
-        self._waiting.append(message)
-        return True
 
     def _run(self) -> None:
         try:
@@ -97,9 +87,10 @@ class Recorder:
             self.failure = f"{self.path} cannot be written any more ({getattr(error, 'strerror', None) or error})"
             self._waiting.clear()
 
-    def _write(self, message: _Scan | _Imu) -> None:
-        if len(message) == 4:
-            self._mcap.add_imu(*message)
-        else:
-            self._scans_waiting -= 1
-            self._mcap.add_scan(*message)
+    def _write(self, entry: ScanEntry | ImuEntry) -> None:
+        if isinstance(entry, ImuEntry):
+            self._mcap.add_imu(entry.stamp_ns, entry.gyro, entry.accel, entry.log_ns)
+            return
+        self._scans_waiting -= 1
+        if isinstance(entry.scan, Scan):
+            self._mcap.add_scan(entry.scan, entry.log_ns)

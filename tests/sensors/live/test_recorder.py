@@ -19,7 +19,7 @@ from app.sensors.live import recorder as recorder_module
 from app.sensors.live.intake import Intake
 from app.sensors.live.recorder import MAX_SCANS, Recorder
 from app.sensors.live.source import LiveSource
-from app.sensors.recording import open_recording
+from app.sensors.recording import ImuEntry, ScanEntry, open_recording
 from app.sensors.ros import IMU_TOPIC, LIDAR_TOPIC, stamp_ns
 from app.sensors.source import Source
 from app.slam.errors import HemislamError
@@ -45,8 +45,8 @@ def record(recorder: Recorder, turns: range) -> None:
     for turn in turns:
         for k in range(20):
             stamp = sensor.START_NS + turn * TURN_NS + k * 5_000_000
-            recorder.add_imu(stamp, (0.1, 0.2, 0.001 * k), (0.0, 0.0, 9.81), stamp + 1_000_000)
-        recorder.add_scan(scan(turn), sensor.START_NS + (turn + 1) * TURN_NS + 3_000_000)
+            recorder.add(ImuEntry(stamp + 1_000_000, stamp, (0.1, 0.2, 0.001 * k), (0.0, 0.0, 9.81)))
+        recorder.add(ScanEntry(sensor.START_NS + (turn + 1) * TURN_NS + 3_000_000, None, scan(turn)))
 
 
 def scans(path: Path) -> list[Scan]:
@@ -215,7 +215,7 @@ def test_a_name_that_could_not_be_opened_again_is_refused_before_anything_is_los
 def test_a_time_that_ros_has_no_number_for_is_left_out(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "session.mcap")
     record(recorder, range(3))
-    recorder.add_imu(1 << 61, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), sensor.START_NS)
+    recorder.add(ImuEntry(sensor.START_NS, 1 << 61, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)))
     recorder.close()
     assert (recorder.failure, recorder.left_out) == ("", 1)
     assert len(scans(recorder.path)) == 3
@@ -226,7 +226,7 @@ def test_a_disk_that_is_too_slow_costs_scans_of_the_recording_and_no_memory(tmp_
     recorder._write = lambda message: time.sleep(0.01)  # type: ignore[method-assign]
     one = scan(0)
     for number in range(MAX_SCANS + 50):
-        recorder.add_scan(one, sensor.START_NS + number)
+        recorder.add(ScanEntry(sensor.START_NS + number, None, one))
     assert recorder.left_out >= 1
     assert len(recorder._waiting) <= MAX_SCANS
     recorder._write = lambda message: None  # type: ignore[method-assign]
@@ -240,13 +240,13 @@ def test_scans_left_out_of_a_full_queue_do_not_count_as_waiting(
     recorder, stalled = Recorder(tmp_path / "session.mcap"), threading.Event()
     recorder._write = lambda message: stalled.wait(20.0)  # type: ignore[assignment,method-assign]
     for number in range(60):
-        recorder.add_imu(number, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), number)
+        recorder.add(ImuEntry(number, number, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8)))
     for number in range(MAX_SCANS + 50):
-        recorder.add_scan(scan(0), sensor.START_NS + number)
+        recorder.add(ScanEntry(sensor.START_NS + number, None, scan(0)))
     stalled.set()
     while recorder._waiting:
         time.sleep(0.01)
     before = recorder.left_out
-    recorder.add_scan(scan(0), sensor.START_NS)
+    recorder.add(ScanEntry(sensor.START_NS, None, scan(0)))
     recorder.close()
     assert recorder.left_out == before, "the disk keeps up again"
