@@ -7,6 +7,8 @@ next one are there, so that a late packet still finds its place.
 import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,32 +30,29 @@ _LATE = 64
 """If a packet's number is this far back, the count has begun anew."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Head:
-    """The head of a measurement packet: its sender, its time (None: without a date), and its number."""
+class _Packet(NamedTuple):
+    """A measurement packet.
 
+    Attributes:
+        stamp_ns: time of the first block; of a packet without a date, its arrival. arrival_ns: by the host's clock.
+        number: which the sensor gave it. azimuths: of each block, 0.01 deg; if the sensor does not turn, by time, as if
+            one scan were a turn.
+    """
+
+    stamp_ns: int
+    arrival_ns: int
+    data: bytes
     sensor: Model | Livox
-    stamp_ns: int | None
-    index: int
-
-
-def _read(packet: bytes) -> _Head | None:
-    """None if it holds no measurements."""
-    model = msop.model_of(packet)
-    if model is not None:
-        return _Head(model, msop.stamp_of(packet, model), msop.index_of(packet, model))
-    header = read_header(packet)
-    return _Head(MID360, header.stamp_ns, header.number) if header is not None and not header.of_imu else None
-
-
-Pending = tuple[int, int, bytes, _Head]
-"""Time of the first block, arrival, packet, and its head."""
+    number: int
+    azimuths: tuple[int, ...]
 
 
 def sensor_of(packet: bytes) -> Model | Livox | None:
     """The sensor that sent this measurement packet; None if it holds no measurements."""
-    head = _read(packet)
-    return None if head is None else head.sensor
+    if (model := msop.model_of(packet)) is not None:
+        return model
+    header = read_header(packet)
+    return MID360 if header is not None and not header.of_imu else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,44 +87,39 @@ class Assembler:
         self.counters = counters if counters is not None else Counters()
         self.turn_ns = 100_000_000
         self._models = models
-        self._pending: list[Pending] = []
+        self._pending: list[_Packet] = []
         self._model: Model | Livox | None = None
         self._first = 0
         self._checked = 0
         self._given_ns: int | None = None
-        self._suspect: Pending | None = None
+        self._suspect: _Packet | None = None
         self._sense = 0
-        self._index: int | None = None
+        self._number: int | None = None
 
     def add(self, packet: bytes, arrival_ns: int) -> list[Revolution]:
         """Revolutions that this packet completes, mostly none. arrival_ns: by the host's clock."""
-        head = _read(packet)
-        if head is None or (self._models and head.sensor not in self._models):
+        sensor = sensor_of(packet)
+        if sensor is None or (self._models and sensor not in self._models):
             if msop.is_cut(packet):
                 self.counters.truncated += 1
             else:
                 self.counters.foreign += 1
             return []
-        model, stamp = head.sensor, head.stamp_ns
-        if stamp is None:
-            self.counters.undated += 1
-            stamp = arrival_ns
-        entry = (stamp, arrival_ns, packet, head)
-        newest = self._pending[-1][0] if self._pending else self._given_ns
+        entry = self._read(packet, sensor, arrival_ns)
+        newest_ns = self._pending[-1].stamp_ns if self._pending else self._given_ns
         frames: list[Revolution] = []
-        if newest is not None and (abs(stamp - newest) > JUMP_NS or model is not self._model):
+        if newest_ns is not None and (abs(entry.stamp_ns - newest_ns) > JUMP_NS or sensor is not self._model):
             suspect, self._suspect = self._suspect, entry
-            if suspect is None or abs(stamp - suspect[0]) > JUMP_NS or model is not suspect[3].sensor:
+            if suspect is None or abs(entry.stamp_ns - suspect.stamp_ns) > JUMP_NS or sensor is not suspect.sensor:
                 self.counters.strays += suspect is not None
                 return []
             frames = list(self.flush())  # it is another time now
-            self._given_ns, self._index = None, None
-            self._model = model
+            self._given_ns, self._number = None, None
             self._insert(suspect)
         elif self._suspect is not None:
             self.counters.strays += 1
         self._suspect = None
-        self._model = model
+        self._model = sensor
         self._insert(entry)
         while len(self._pending) - HOLD > self._checked:
             frames += self._check()
@@ -141,19 +135,32 @@ class Assembler:
 
     def pending_since(self) -> int | None:
         """When the newest waiting packet arrived, by the host's clock; None if no packet waits."""
-        return self._pending[-1][1] if self._pending else None
+        return self._pending[-1].arrival_ns if self._pending else None
 
-    def _insert(self, entry: Pending) -> None:
-        stamp, _, _, head = entry
-        pending = self._pending
+    def _read(self, data: bytes, sensor: Model | Livox, arrival_ns: int) -> _Packet:
+        """A packet of this sensor."""
+        if isinstance(sensor, Livox):
+            header = read_header(data)
+            assert header is not None
+            turned = header.stamp_ns % SCAN_NS * TURN // SCAN_NS
+            return _Packet(header.stamp_ns, arrival_ns, data, sensor, header.number, (turned,))
+        stamp_ns = msop.stamp_of(data, sensor)
+        if stamp_ns is None:
+            self.counters.undated += 1
+            stamp_ns = arrival_ns
+        number, azimuths = msop.index_of(data, sensor), msop.azimuths_of(data, sensor)
+        return _Packet(stamp_ns, arrival_ns, data, sensor, number, azimuths)
+
+    def _insert(self, entry: _Packet) -> None:
+        stamp, pending = entry.stamp_ns, self._pending
         if self._given_ns is not None and stamp <= self._given_ns:
             self.counters.late += 1
             return
-        if not pending or stamp > pending[-1][0]:
+        if not pending or stamp > pending[-1].stamp_ns:
             pending.append(entry)
         else:
-            at = bisect.bisect_left(pending, stamp, key=lambda other: other[0])
-            if pending[at][0] == stamp:
+            at = bisect.bisect_left(pending, stamp, key=attrgetter("stamp_ns"))
+            if pending[at].stamp_ns == stamp:
                 self.counters.duplicates += 1
                 return
             if at == 0 and self._given_ns is not None:  # before the packet in which the revolution begins
@@ -163,43 +170,35 @@ class Assembler:
             pending.insert(at, entry)
             self._checked = min(self._checked, at)
         self.counters.packets += 1
-        self._count_lost(head.index)
+        self._count_lost(entry.number)
 
-    def _count_lost(self, index: int) -> None:
+    def _count_lost(self, number: int) -> None:
         """Count lost packets by their numbers; a packet that arrives late is no longer counted as lost."""
-        ahead = 0 if self._index is None else (index - self._index + (1 << 15)) % (1 << 16) - (1 << 15)
+        ahead = 0 if self._number is None else (number - self._number + (1 << 15)) % (1 << 16) - (1 << 15)
         if -_LATE < ahead < 0:
             self.counters.lost = max(self.counters.lost - 1, 0)
             return
         self.counters.lost += max(ahead - 1, 0)
-        self._index = index
+        self._number = number
 
     def _check(self) -> list[Revolution]:
         """Look for the end of a revolution in the next packet."""
         at = self._checked
         self._checked += 1
-        stamp = self._pending[at][0]
+        stamp, azimuth = self._pending[at].stamp_ns, self._pending[at].azimuths
         begin = self._first if at == 0 else 0
-        azimuth = self._azimuths_at(at)
         moved = (azimuth[-1] - azimuth[begin] + TURN // 2) % TURN - TURN // 2
         if moved:
             self._sense = max(-8, min(8, self._sense + (1 if moved > 0 else -1)))
         sense = 1 if self._sense >= 0 else -1
-        if at and (stamp - self._pending[at - 1][0] > 0.97 * self.turn_ns or at >= MAX_PACKETS):
+        if at and (stamp - self._pending[at - 1].stamp_ns > 0.97 * self.turn_ns or at >= MAX_PACKETS):
             return [self._split(at, 0)]
-        before = self._azimuths_at(at - 1)[-1] if at else azimuth[begin]
+        before = self._pending[at - 1].azimuths[-1] if at else azimuth[begin]
         for block in range(begin, len(azimuth)):
             if (azimuth[block] - before) * sense < 0:
                 return [self._split(at, block)]
             before = azimuth[block]
         return []
-
-    def _azimuths_at(self, at: int) -> tuple[int, ...]:
-        """Azimuth of each block, 0.01 deg. If the sensor does not turn: by time, as if one scan were a turn."""
-        stamp_ns, _, packet, head = self._pending[at]
-        if isinstance(head.sensor, Livox):
-            return (stamp_ns % SCAN_NS * TURN // SCAN_NS,)
-        return msop.azimuths_of(packet, head.sensor)
 
     def _split(self, at: int, block: int) -> Revolution:
         """End the revolution before this block of the packet `at`; the next one begins there."""
@@ -214,14 +213,15 @@ class Assembler:
         taken = self._pending[:packets]
         assert self._model is not None
         self.counters.frames += 1
-        self._given_ns = taken[-1][0] if stop is None else taken[-2][0] if len(taken) > 1 else self._given_ns
-        longest = max(len(packet) for _, _, packet, _ in taken)
-        data = np.frombuffer(b"".join(packet.ljust(longest, b"\0") for _, _, packet, _ in taken), np.uint8)
+        whole = taken if stop is None else taken[:-1]
+        self._given_ns = whole[-1].stamp_ns if whole else self._given_ns
+        longest = max(len(packet.data) for packet in taken)
+        data = np.frombuffer(b"".join(packet.data.ljust(longest, b"\0") for packet in taken), np.uint8)
         return Revolution(
             model=self._model,
             packets=data.reshape(len(taken), longest),
-            stamps_ns=np.array([stamp for stamp, *_ in taken], np.int64),
+            stamps_ns=np.array([packet.stamp_ns for packet in taken], np.int64),
             first=self._first,
             stop=self._model.blocks if stop is None else stop,
-            arrival_ns=max(arrival for _, arrival, _, _ in taken),
+            arrival_ns=max(packet.arrival_ns for packet in taken),
         )
