@@ -94,9 +94,9 @@ class Recording(AbstractContextManager["Recording"]):
         self.topics = source.topics
         chosen = params.recording
         lidar, lidar_finding = choose_topic(source, "lidar", chosen.lidar_topic)
-        self.lidar_topic, self.imu_topic, imu_finding = lidar.name, "", NO_IMU
+        self.lidar_topic, self.imu_topic, topic_finding = lidar.name, "", NO_IMU
         if chosen.imu_topic or any(topic.type in usable_types("imu") and topic.messages for topic in source.topics):
-            imu_topic, imu_finding = choose_topic(source, "imu", chosen.imu_topic)
+            imu_topic, topic_finding = choose_topic(source, "imu", chosen.imu_topic)
             self.imu_topic = imu_topic.name
         self.scan_count = lidar.messages
         self.gnss_topic = navsat_topic(source)
@@ -105,7 +105,12 @@ class Recording(AbstractContextManager["Recording"]):
         probes, probe_findings = probe_clouds(source, lidar)
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
         probes, scans = self._decode_probes(probes, cloud_findings)
-        self._look_at_clocks()
+        self._imu_stamped, self._imu_units, self._leaps = True, AS_RECORDED, Leaps()
+        imu: ImuProbe | None = None
+        imu_findings: list[Finding] = []
+        if self.imu_topic:
+            imu, self._imu_stamped, imu_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
+        self._leaps = self._find_leaps()
         source.first_scan_ns = probes[0].log_ns
         self.start_ns = scans[0].stamp_ns + added_ns(self._leaps.lidar, probes[0].log_ns)
         log_start_ns = int(self.log_times(np.array([probes[0].log_ns]))[0])
@@ -120,11 +125,12 @@ class Recording(AbstractContextManager["Recording"]):
         once = [not is_copy(scan, last) for scan, last in zip(scans, before, strict=True)]
         self._clocks = Finding("clocks", "fine", "there is one only")
         self.preset = preset_for(lidar.type, probes[0])
-        imu_findings = self._look_at_imu(scan_times)
+        if imu is not None:
+            imu_findings += self._settle_imu(imu, scan_times)
         self.findings: tuple[Finding, ...] = (
             *source.findings,
             lidar_finding,
-            imu_finding,
+            topic_finding,
             *(Finding("clock leap", "corrected", text) for text in self._leaps_told.values()),
             *overlap_finding(scan_times[once], self.lidar_topic),
             *probe_findings,
@@ -134,14 +140,8 @@ class Recording(AbstractContextManager["Recording"]):
             *imu_findings,
         )
 
-    def _look_at_clocks(self) -> None:
-        """Find out whether the IMU's headers carry times, and where clocks leap."""
-        self._imu_stamped, self._imu_units, self._leaps = True, AS_RECORDED, Leaps()
-        self._imu_probe: tuple[ImuProbe, list[Finding]] | None = None
-        if self.imu_topic:
-            offset_s = self.params.recording.imu_time_offset
-            imu, self._imu_stamped, findings = probe_imu(self._source, self.imu_topic, offset_s)
-            self._imu_probe = imu, findings
+    def _find_leaps(self) -> Leaps:
+        """Where clocks leap, by messages that are read without bridging any."""
 
         def times(topic: str) -> Times:
             return lambda first_ns, stop_ns: (
@@ -162,20 +162,17 @@ class Recording(AbstractContextManager["Recording"]):
         source = self._source
         of_imu = times(self.imu_topic) if self.imu_topic else None
         scans_ns = self.scan_count * self._layout.timing.period_ns
-        self._leaps = find_leaps(times(self.lidar_topic), of_imu, source.start_ns, source.end_ns, scans_ns, continues)
+        return find_leaps(times(self.lidar_topic), of_imu, source.start_ns, source.end_ns, scans_ns, continues)
 
-    def _look_at_imu(self, scan_times: I64) -> list[Finding]:
+    def _settle_imu(self, imu: ImuProbe, scan_times: I64) -> list[Finding]:
         """Settle how IMU samples are read, from the first ones; `scan_times` as for `clock_finding`."""
-        if self._imu_probe is None:
-            return []
         chosen = self.params.recording
-        imu, probe_findings = self._imu_probe
         bridged = imu.stamps_ns + all_added_ns(self._leaps.imu, imu.log_ns)
         imu = replace(imu, log_ns=self.log_times(imu.log_ns), stamps_ns=bridged)
         self._imu_units, imu_findings = settle_imu(imu, chosen)
         self._clocks = clock_finding(scan_times, np.column_stack([imu.log_ns, imu.stamps_ns]), chosen.imu_time_offset)
         gravity = gravity_findings(imu, self._imu_units, self.params, self.preset)
-        return [*probe_findings, *imu_findings, self._clocks, *gravity]
+        return [*imu_findings, self._clocks, *gravity]
 
     @property
     def has_lines(self) -> bool:
