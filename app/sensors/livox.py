@@ -75,13 +75,15 @@ class CustomMsg:
         return cls._of(seconds, nanoseconds, stated, points)
 
     @classmethod
-    def made(cls, times_ns: I64, points: F32, reflectivity: U8, tag: U8) -> "CustomMsg":
-        """From points (n, 3) m at times (n,), stamped at the earliest."""
+    def made(
+        cls, times_ns: I64, points: F32, reflectivity: npt.ArrayLike, tag: npt.ArrayLike, line: npt.ArrayLike = 0
+    ) -> "CustomMsg":
+        """From points (n, 3) m at times (n,), stamped at the earliest; the rest for each or for all."""
         begin_ns = int(times_ns.min())
         rows = np.zeros(len(points), _dtype("<", 20))
         rows["x"], rows["y"], rows["z"] = points.T
         rows["offset_time"] = np.minimum(times_ns - begin_ns, np.iinfo(np.uint32).max)
-        rows["reflectivity"], rows["tag"] = reflectivity, tag
+        rows["reflectivity"], rows["tag"], rows["line"] = reflectivity, tag, line
         return cls._of(*divmod(begin_ns, 1_000_000_000), len(rows), rows)
 
     @classmethod
@@ -116,11 +118,8 @@ def definition(kind: str) -> str:
 
 def encoded(scan: Scan) -> bytes:
     """The scan as livox_ros_driver2 sends it: CDR, stamped at the first point, lines 0 to 3 in turn."""
-    points = np.zeros(len(scan), _dtype("<", 20))
-    points["x"], points["y"], points["z"] = scan.points.T
-    points["offset_time"], points["reflectivity"] = scan.offsets_ns, scan.intensity
-    points["tag"], points["line"] = _SURE, np.arange(len(scan)) % 4
-    return CustomMsg._of(*divmod(scan.stamp_ns, 1_000_000_000), len(scan), points).cdr()
+    times_ns = scan.stamp_ns + scan.offsets_ns.astype(np.int64)
+    return CustomMsg.made(times_ns, scan.points, scan.intensity, _SURE, np.arange(len(scan)) % 4).cdr()
 
 
 def _dtype(order: str, step: int) -> np.dtype[Any]:

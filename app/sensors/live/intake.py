@@ -45,7 +45,7 @@ MAX_HELD = 50_000
 _SETTLE_NS = 1_000_000_000
 _SETTLE_SCANS = 3
 _SWAY_NS = 2_000_000_000
-"""s: samples must span this time to determine a gyroscope's unit."""
+"""Samples must span this time to determine a gyroscope's unit."""
 _TOO_FAST_SAMPLES = 20
 """If this many samples in a row are too fast, it was not a knock."""
 _AHEAD_NS, _LATE_NS = -50_000_000, 2_000_000_000
