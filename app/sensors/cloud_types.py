@@ -68,19 +68,10 @@ class CloudMessage:
 
     def xyz(self) -> F32:
         """(n, 3) float32 m, as stored, including NaN and zeros. Returns of low confidence of a Livox become zeros."""
-        points = self._stored_xyz()
+        points: F32 = np.stack([self.column(name).astype(np.float32) for name in "xyz"], axis=1)
         if self.fields.keys() >= _LIVOX and (tag := self.column("tag")).dtype == np.uint8:
             points[(tag & DOUBTFUL) != 0] = 0.0
         return points
-
-    def _stored_xyz(self) -> F32:
-        """(n, 3) float32 m as stored, copied."""
-        offsets = [self.fields.get(name, (-1, np.dtype("V1"))) for name in "xyz"]
-        first, dtype = offsets[0]
-        if dtype == np.dtype("<f4") and len(self) and offsets == [(first + 4 * i, dtype) for i in range(3)]:
-            view = np.ndarray((self.height, self.width), "V12", self.data.data, first, (self.row_step, self.point_step))
-            return view.flatten().view(dtype).reshape(-1, 3)  # a whole point at a time: packed numbers are slow to read
-        return np.stack([self.column(name).astype(np.float32) for name in "xyz"], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
