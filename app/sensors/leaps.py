@@ -89,19 +89,19 @@ def find_leaps(
             continue
         done_ns = after_ns + AROUND_NS
         steps = [_greatest_steps(times, before_ns, after_ns) for times in topics]
-        (lidar_at_ns, lidar_ns), (imu_at_ns, imu_ns), (log_at_ns, log_ns) = steps[0][0], steps[-1][0], steps[-1][1]
-        lost_ns = min((lidar_ns, imu_ns, log_ns), key=abs)  # the same in all if messages were lost meanwhile
+        (of_scans, log_of_scans), (of_samples, log) = steps[0], steps[-1]
+        # what is the same in all is due to messages that were lost meanwhile
+        lost_ns = min((of_scans.by_ns, of_samples.by_ns, log.by_ns), key=abs)
         if abs(lost_ns) < JITTER_NS or (lost_ns > AROUND_NS and continues(before_ns, after_ns)):
             lost_ns = 0
-        if abs(lidar_ns - imu_ns) < JITTER_NS:
-            imu_ns = lidar_ns
+        same = abs(of_scans.by_ns - of_samples.by_ns) < JITTER_NS
         for leaps, at_ns, by_ns in (
-            (of_lidar, lidar_at_ns, lidar_ns - lost_ns),
-            (of_imu, imu_at_ns, imu_ns - lost_ns),
-            (of_log, min(log_at_ns, steps[0][1][0]), log_ns - lost_ns),
+            (of_lidar, of_scans.at_ns, of_scans.by_ns),
+            (of_imu, of_samples.at_ns, of_scans.by_ns if same else of_samples.by_ns),
+            (of_log, min(log.at_ns, log_of_scans.at_ns), log.by_ns),
         ):
-            if abs(by_ns) > LEAST_NS:
-                leaps.append(Leap(at_ns, by_ns))
+            if abs(by_ns - lost_ns) > LEAST_NS:
+                leaps.append(Leap(at_ns, by_ns - lost_ns))
     if imu is not None and bool(of_lidar) != bool(of_imu):
         first, last = (_apart(topics, *part) for part in ((start_ns, end_ns), (end_ns - AROUND_NS, end_ns)))
         if abs(last) > abs(first) + LEAST_NS:
@@ -213,19 +213,16 @@ def _look(times: Times, first_ns: int, end_ns: int) -> tuple[int, int] | None:
     return (int(messages[0, 0]), int(np.median(messages[:, 1] - messages[:, 0]))) if len(messages) else None
 
 
-def _greatest_steps(times: Times, before_ns: int, after_ns: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The greatest step of a topic's stamps around this moment, and that of its log times. Each is given by the log
-    time after it and its excess over the usual interval."""
+def _greatest_steps(times: Times, before_ns: int, after_ns: int) -> tuple[Leap, Leap]:
+    """The greatest step of a topic's stamps around this moment, and that of its log times, beyond the usual step."""
     messages = _listed(times, before_ns - AROUND_NS, after_ns + AROUND_NS)
     if len(messages) < 3:
-        return (after_ns, 0), (after_ns, 0)
+        return Leap(after_ns, 0), Leap(after_ns, 0)
     steps = np.diff(messages, axis=0)
     steps -= int(np.median(steps[:, 1]))
-    of_log, of_stamp = np.abs(steps).argmax(axis=0).tolist()
-    return (int(messages[of_stamp + 1, 0]), int(steps[of_stamp, 1])), (
-        int(messages[of_log + 1, 0]),
-        int(steps[of_log, 0]),
-    )
+    greatest = np.abs(steps).argmax(axis=0).tolist()
+    log, stamps = (Leap(int(messages[k + 1, 0]), int(steps[k, part])) for part, k in enumerate(greatest))
+    return stamps, log
 
 
 def _listed(times: Times, first_ns: int, stop_ns: int) -> I64:
