@@ -126,11 +126,7 @@ class ImuOrder:
 
     def flush(self) -> list[ImuSample]:
         """The samples that wait for a missing one, which is no longer awaited."""
-        ready = []
-        while self._ahead:
-            self._skip_missing()
-            ready += self._take()
-        return ready
+        return self._released(0)
 
     def _one(self, sample: ImuSample) -> list[ImuSample]:
         ready: list[ImuSample] = []
@@ -145,20 +141,14 @@ class ImuOrder:
             return ready
         self.counters.imu += 1
         self._ahead[sample.number] = sample
-        if len(self._ahead) > _HOLD:
-            self._skip_missing()
-        return ready + self._take()
+        return ready + self._released(_HOLD)
 
-    def _skip_missing(self) -> None:
-        """Continue with the first available sample."""
-        assert self._next is not None
-        missing, first = min(((number - self._next) % (1 << 32), number) for number in self._ahead)
-        self.counters.imu_lost += missing
-        self._next = first
-
-    def _take(self) -> list[ImuSample]:
+    def _released(self, most: int) -> list[ImuSample]:
+        """The samples that follow in order; if more than `most` wait for missing ones, without these."""
         ready = []
-        while self._next in self._ahead:
-            ready.append(self._ahead.pop(self._next))
-            self._next = (self._next + 1) % (1 << 32)
+        while self._next is not None and (self._next in self._ahead or len(self._ahead) > most):
+            missing, first = min(((number - self._next) % (1 << 32), number) for number in self._ahead)
+            self.counters.imu_lost += missing
+            ready.append(self._ahead.pop(first))
+            self._next = (first + 1) % (1 << 32)
         return ready
