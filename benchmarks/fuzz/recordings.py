@@ -32,7 +32,7 @@ import app.slam.doubts  # noqa: F401
 from app.__main__ import main
 from app.sensors.cloud_types import read_point_cloud_2
 from app.sensors.live.feed import packets_of
-from app.sensors.live.livox_udp import SLOT_NS, LivoxWriter, write_imu
+from app.sensors.live.livox_udp import SLOT_NS, LivoxWriter
 from app.sensors.recording import ImuEntry, ScanEntry, open_recording
 from app.sensors.robosense import AIRY, BPEARL, Model
 from app.sensors.ros import CLOUD, IMU, IMU_TOPIC, LIDAR_TOPIC, header, serialised
@@ -121,7 +121,7 @@ class Recordings:
                     packets = writer.add(replace(entry.scan, offsets_ns=offsets))
                     sent += [(time_ns, PORTS[0], packet) for time_ns, packet in packets]
                 elif isinstance(entry, ImuEntry):
-                    sent.append((entry.stamp_ns, PORTS[2], write_imu(entry.stamp_ns, entry.gyro, entry.accel, 0)))
+                    sent.append((entry.stamp_ns, PORTS[2], writer.imu(entry.stamp_ns, entry.gyro, entry.accel)))
         return sorted(sent)
 
     def broken(self, seed: int) -> str:

@@ -7,14 +7,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import count, islice
+from itertools import islice
 from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
 from app.sensors import ros
-from app.sensors.live import livox_udp
 from app.sensors.live.clock import ClockMap
 from app.sensors.live.devices import DEVICES
 from app.sensors.live.difop import ChannelAngles, Difop, read_angles, write_difop
@@ -31,7 +30,7 @@ from app.sensors.source import Source
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import F64, Scan
+from app.slam.types import F64, Scan, Vector
 
 LIDAR, DEVICE, IMU = 0, 1, 2
 _DEVICE_PERIOD_NS = 1_000_000_000
@@ -62,42 +61,31 @@ class Pace:
     progress: Callable[[float], None] = lambda seconds: None
 
 
-class _Sensor:
-    """A LiDAR that sends what a recording holds.
+class _RoboSense:
+    """A RoboSense, and the IMU inside or beside it, that send what a recording holds; as `LivoxWriter`."""
 
-    Attributes:
-        add, flush: give the packets that a scan completes, and those of the remaining points, each with its time.
-    """
-
-    def __init__(self, recording: Recording, model: Model | Livox, angles: ChannelAngles | None, pose: F64 | None):
+    def __init__(self, recording: Recording, model: Model, angles: ChannelAngles | None, pose: F64 | None) -> None:
         """Raises HemislamError: it is a recording of another LiDAR."""
-        self._model = model
-        if isinstance(model, Livox):
-            writer = LivoxWriter()
-            self.add, self.flush = writer.add, writer.flush
-            return
         scans = (entry.scan for entry in recording.entries() if isinstance(entry, ScanEntry))
         first = list(islice((scan for scan in scans if isinstance(scan, Scan)), _FITTED))
-        rate = rate_of(first)
-        calibration = angles or fit_angles(first, model, rate)
+        self._model, self._rate_hz = model, rate_of(first)
+        self._angles = angles or fit_angles(first, model, self._rate_hz)
         # A packet's angles have two decimals, the nominal ones four: a receiver without angles uses the nominal ones.
-        own = None if calibration.same(ChannelAngles.nominal(model)) else calibration
-        self._difop = Difop(rpm=60 * rate, serial="68656d690001", calibration=own, T_imu_lidar=pose)
-        packets = PacketWriter(model)
+        own = None if self._angles.same(ChannelAngles.nominal(model)) else self._angles
+        self._difop = Difop(rpm=60 * self._rate_hz, serial="68656d690001", calibration=own, T_imu_lidar=pose)
+        self._packets, self._samples = PacketWriter(model), 0
 
-        def add(scan: Scan) -> list[tuple[int, bytes]]:
-            return packets.add(firings_of(scan, calibration, model, rate))
+    def add(self, scan: Scan) -> list[tuple[int, bytes]]:
+        return self._packets.add(firings_of(scan, self._angles, self._model, self._rate_hz))
 
-        self.add, self.flush = add, packets.flush
+    def flush(self) -> list[tuple[int, bytes]]:
+        return self._packets.flush()
 
-    def settings(self, stamp_ns: int) -> bytes | None:
-        """The packet in which the sensor states its settings, if it does."""
-        return None if isinstance(self._model, Livox) else write_difop(self._difop, stamp_ns, self._model)
+    def settings(self, stamp_ns: int) -> bytes:
+        return write_difop(self._difop, stamp_ns, self._model)
 
-    def imu(self, sample: ImuSample) -> bytes:
-        """The sample as the sensor's own IMU, or a separate one, sends it."""
-        if isinstance(self._model, Livox):
-            return livox_udp.write_imu(sample.stamp_ns, sample.gyro, sample.accel, sample.number or 0)
+    def imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> bytes:
+        sample, self._samples = ImuSample(self._samples, stamp_ns, gyro, accel), self._samples + 1
         return write_airy_imu(sample) if self._model is AIRY else write_imu(sample)
 
 
@@ -116,11 +104,10 @@ def packets_of(
         HemislamError: it is a recording of another LiDAR.
     """
     stop_ns = math.inf if duration_s is None else recording.start_ns + duration_s * 1e9
-    sensor = _Sensor(recording, model, angles, pose)
+    sensor = LivoxWriter() if isinstance(model, Livox) else _RoboSense(recording, model, angles, pose)
     waiting: list[Sent] = []
     by_time = attrgetter("time_ns")
     lidar, imu = ClockMap(), ClockMap()
-    samples = count()
     stated_ns = shift_ns = before_ns = end_ns = 0
 
     def packets(made: list[tuple[int, bytes]]) -> list[Sent]:
@@ -151,8 +138,7 @@ def packets_of(
         elif isinstance(entry, ImuEntry) and np.isfinite(entry.gyro + entry.accel).all():
             time_ns = imu.map(entry.stamp_ns, entry.log_ns)
             if time_ns < stop_ns + 2e8:
-                sample = ImuSample(next(samples), entry.stamp_ns, entry.gyro, entry.accel)
-                waiting.append(Sent(time_ns, IMU, sensor.imu(sample)))
+                waiting.append(Sent(time_ns, IMU, sensor.imu(entry.stamp_ns, entry.gyro, entry.accel)))
     waiting += packets(sensor.flush())
     yield from sorted(waiting, key=by_time)
 

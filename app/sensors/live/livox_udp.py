@@ -82,11 +82,6 @@ def read_imu(packet: bytes) -> tuple[int, Vector, Vector] | None:
     return header.stamp_ns, (gx, gy, gz), (ax, ay, az)
 
 
-def write_imu(stamp_ns: int, gyro: Vector, accel: Vector, number: int) -> bytes:
-    """The sample as the sensor sends it. gyro: rad/s. accel: m/s^2."""
-    return _packet(_SAMPLE.pack(*gyro, *(value / STANDARD_GRAVITY for value in accel)), stamp_ns, 0, 1, number, 0)
-
-
 def read_points(packets: U8, shift_ns: int = 0) -> CustomMsg:
     """The points of a scan's packets (n, bytes), each padded at its end, as Livox's ROS driver would send them.
 
@@ -105,10 +100,10 @@ def read_points(packets: U8, shift_ns: int = 0) -> CustomMsg:
 
 
 class LivoxWriter:
-    """Packs scans into datagrams, as the sensor does: one may hold points of two scans."""
+    """Packs scans and samples into datagrams, as the sensor does: one may hold points of two scans."""
 
     def __init__(self) -> None:
-        self._number = 0
+        self._number = self._samples = 0
         self._base_ns: int | None = None
         self._slots: I64 = np.empty(0, np.int64)
         self._rows: npt.NDArray[Any] = np.empty(0, _MEASURED[1][0])
@@ -136,6 +131,16 @@ class LivoxWriter:
     def flush(self) -> list[tuple[int, bytes]]:
         """The packet of the remaining points."""
         return self._sent(int(self._slots.max()) // SLOTS + 1) if len(self._slots) else []
+
+    def settings(self, stamp_ns: int) -> bytes | None:
+        """The packet in which the sensor states its settings; a Mid-360 sends none."""
+        return None
+
+    def imu(self, stamp_ns: int, gyro: Vector, accel: Vector) -> bytes:
+        """A sample. gyro: rad/s. accel: m/s^2."""
+        body = _SAMPLE.pack(*gyro, *(value / STANDARD_GRAVITY for value in accel))
+        self._samples += 1
+        return _packet(body, stamp_ns, 0, 1, self._samples - 1, 0)
 
     def _sent(self, stop: int) -> list[tuple[int, bytes]]:
         """All packets before this one."""
