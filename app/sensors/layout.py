@@ -58,10 +58,9 @@ def settle_cloud(
                 time_findings[0] = _of_parts(time_findings[0], share, rate, chosen.rotation_rate)
         if spin.start is None:  # then the header stamp can only be the time of the cloud's own first or last point
             timing = replace(timing, anchor="last" if timing.shift_ns else "first", shift_ns=0)
-    else:
-        if rings.of_lines:
-            firsts = np.stack([probe.points[probe.column(timing.field).argmin()] for probe in probes])
-            time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing, firsts))
+    elif rings.of_lines:
+        firsts = np.stack([probe.points[probe.column(timing.field).argmin()] for probe in probes])
+        time_findings.append(_rotation_finding(clouds[-1], probes[-1].column(timing.field), timing, firsts))
     layout = CloudLayout(
         timing=timing,
         rings=rings,

@@ -43,12 +43,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         before: the state of the source that this one replaces.
     """
 
-    def __init__(
-        self,
-        receivers: list[Receive],
-        intake: Intake,
-        before: Known | None = None,
-    ) -> None:
+    def __init__(self, receivers: list[Receive], intake: Intake, before: Known | None = None) -> None:
         self._intake, self._recorder = intake, intake.recorder
         self._recorded_before = (before and before.state.recorded) or 0
         self._sequencer = (before and before.pairing) or Sequencer(intake.params.imu)
