@@ -4,7 +4,6 @@ A keyframe is searched once all keyframes of its submap have come and odometry b
 surroundings are as dense as those of the older keyframes that it is compared with.
 """
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -77,15 +76,11 @@ class Detector:
         self._poses = np.empty((0, 4, 4))
         self._stamps = np.empty(0, np.int64)
         self._resumed, self._astray = np.empty(0, np.bool_), np.empty(0)
-        self.stand(0, ())
+        self._contexts: list[ScanContext] = []
+        self._count = 0
 
     def __len__(self) -> int:
         return self._count
-
-    @property
-    def described(self) -> int:
-        """How many keyframes, counted from the first, can be searched for loops."""
-        return len(self._contexts)
 
     def head(self, index: int) -> Keyframe:
         """A keyframe without its points; it may lie beyond the present one."""
@@ -112,7 +107,7 @@ class Detector:
         return np.cumsum(self.resumed)
 
     def take(self, keyframe: Keyframe) -> None:
-        """Store a new keyframe with its cloud; `go_on` and `stand` go to it."""
+        """Store a new keyframe with its cloud; `go_to` goes to it."""
         self._heads.append(replace(keyframe, cloud=_NO_POINTS))
         self._poses = np.concatenate([self._poses, keyframe.T_odom_imu[None]])
         self._stamps = np.append(self._stamps, keyframe.stamp_ns)
@@ -120,20 +115,9 @@ class Detector:
         self._astray = np.append(self._astray, keyframe.astray)
         self._submaps.append(keyframe)
 
-    def stand(self, count: int, contexts: Sequence[ScanContext]) -> None:
-        """Go to the first `count` keyframes that were taken, with these contexts."""
-        self._count, self._contexts = count, list(contexts)
-        self._keys = [context.ring_key for context in contexts]
-
-    def go_on(self) -> None:
-        """Go to the next keyframe that was taken."""
-        self._count += 1
-
-    def learn(self, contexts: Iterable[ScanContext]) -> None:
-        """Store the contexts of the next keyframes that have none."""
-        for context in contexts:
-            self._contexts.append(context)
-            self._keys.append(context.ring_key)
+    def go_to(self, count: int) -> None:
+        """Go to the first `count` keyframes that were taken."""
+        self._count = count
 
     def forget(self) -> None:
         """Forget the keyframes beyond the present one."""
@@ -143,6 +127,7 @@ class Detector:
         self._poses, self._stamps = self.poses, self._stamps[: len(self)]
         self._resumed, self._astray = self.resumed, self.astray
         self._submaps.truncate(len(self))
+        del self._contexts[max(len(self) - self.half, 0) :]
         self._around.cache_clear()
         self._prepared.cache_clear()
         self._wide.cache_clear()
@@ -152,13 +137,13 @@ class Detector:
     def close(self) -> None:
         self._submaps.close()
 
-    def describe(self, index: int) -> ScanContext:
-        """The context of a keyframe, from the keyframes around it."""
-        first, last = self._first(index, self.half), self.last(index, self.half)
-        return scan_context.describe(self._around(index, first, last).points)
-
     def context(self, index: int) -> ScanContext:
-        return self._contexts[index] if index < self.described else self.describe(index)
+        """The context of a keyframe, from the keyframes around it; kept once all of these have come."""
+        if index + self.half >= len(self):
+            return self._describe(index)
+        while len(self._contexts) <= index:
+            self._contexts.append(self._describe(len(self._contexts)))
+        return self._contexts[index]
 
     def submap(self, index: int, *, wide: bool = False) -> Prepared:
         """The submap from the keyframes around this one, up to the nearest slip of odometry on either side."""
@@ -187,14 +172,14 @@ class Detector:
 
     def look(self, newer: int, expectation: Expectation, params: LoopsParams) -> list[Sighting]:
         """Older places that look like this keyframe's, the most similar first, each well apart from the others."""
-        p = params
+        p, here = params, self.context(newer)  # made now even if there is nothing to compare, so that no work piles up
         candidates = self._eligible(newer, expectation, p)
         if not len(candidates):
             return []
-        keys = np.array(self._keys)
+        keys = np.array([self.context(older).ring_key for older in candidates])
         ranks = np.arange(1, min(p.candidates, len(candidates)) + 1)
-        _, nearest = KDTree(keys[candidates]).query(keys[newer], k=ranks)  # type: ignore[no-untyped-call]  # no types
-        sightings = [self._compare(int(older), newer, expectation, p) for older in candidates[nearest]]
+        _, nearest = KDTree(keys).query(here.ring_key, k=ranks)  # type: ignore[no-untyped-call]  # no types
+        sightings = [self._compare(int(older), newer, here, expectation, p) for older in candidates[nearest]]
         chosen: list[Sighting] = []
         for sighting in sorted(sightings, key=lambda s: s.distance):
             where = self.poses[sighting.older, :3, 3]
@@ -240,17 +225,18 @@ class Detector:
 
     def _eligible(self, newer: int, expectation: Expectation, params: LoopsParams) -> I64:
         """Keyframes old enough and within the reach of drift."""
-        stamps = self._stamps[: self.described]
-        old = stamps <= self._stamps[newer] - round(params.min_time * 1e9)
+        old = self._stamps[: newer + 1] <= self._stamps[newer] - round(params.min_time * 1e9)
         old[: self._begin(newer)] = True
         old = np.flatnonzero(old)
         away = np.linalg.norm(expectation.poses[old, :3, 3] - expectation.poses[newer, :3, 3], axis=1)
         reach = WIDER * params.max_mahalanobis * expectation.position_sigmas()[old] + NEAR_M
         return np.asarray(old[away < reach])
 
-    def _compare(self, older: int, newer: int, expectation: Expectation, params: LoopsParams) -> Sighting:
-        """Scan Contexts at the column shifts that odometry allows."""
-        distances = scan_context.shift_distances(self._contexts[older], self._contexts[newer])
+    def _compare(
+        self, older: int, newer: int, here: ScanContext, expectation: Expectation, params: LoopsParams
+    ) -> Sighting:
+        """Compare an older place with `here`, the newer one, at the column shifts that odometry allows."""
+        distances = scan_context.shift_distances(self.context(older), here)
         expected = self.guess(older, newer, expectation.poses)
         yaw = np.arctan2(expected[1, 0], expected[0, 0])
         sigma = np.sqrt(expectation.covariance(older)[2, 2])
@@ -273,6 +259,10 @@ class Detector:
         """The first keyframe after the last pause before this one; without a pause, the first of all."""
         paused = np.flatnonzero(self._resumed[: index + 1])
         return int(paused[-1]) if len(paused) else 0
+
+    def _describe(self, index: int) -> ScanContext:
+        first, last = self._first(index, self.half), self.last(index, self.half)
+        return scan_context.describe(self._around(index, first, last).points)
 
     def _far_submap(self, index: int, first: int, last: int) -> Prepared:
         return verification.prepare(self._submaps.around(index, self._poses, first, last, far=True))

@@ -8,12 +8,12 @@ Differences from the paper, for a scanner that sees a hemisphere, also indoors:
   the best shift is the drift of the heading. All shifts are compared at once, by circular correlation.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from app.slam.types import F32, F64
+from app.slam.types import F32, F64, Mask
 
 RINGS, SECTORS = 20, 60
 RADIUS = 20.0
@@ -33,15 +33,16 @@ class ScanContext:
     """Attributes:
     cells: (RINGS, SECTORS), square root of the share of occupied height bins; 0 where unseen.
     seen: (RINGS, SECTORS), whether anything is known.
+    ring_key: (RINGS,), mean over each ring's seen cells; it does not depend on heading.
     """
 
     cells: F32
-    seen: npt.NDArray[np.bool_]
+    seen: Mask
+    ring_key: F32 = field(init=False)
 
-    @property
-    def ring_key(self) -> F32:
-        """(RINGS,), mean over each ring's seen cells; it does not depend on heading."""
-        return np.asarray(self.cells.sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1), dtype=np.float32)
+    def __post_init__(self) -> None:
+        key = self.cells.sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1)
+        object.__setattr__(self, "ring_key", key.astype(np.float32))
 
 
 def describe(points: F32) -> ScanContext:

@@ -5,8 +5,8 @@ the keyframes up to it, so each keyframe is searched once. To know where to look
 made of the loops as they were found.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from app.slam.loops.drift import Drift, Expectation, expect
 from app.slam.loops.edits import apply_edits
 from app.slam.loops.factors import PositionPrior, loosened, odometry_factor
 from app.slam.loops.pose_graph import Graph, Measured
-from app.slam.loops.scan_context import ScanContext
 from app.slam.loops.support import placed, settle
 from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.loops.verdicts import judge
@@ -26,15 +25,6 @@ from app.slam.types import F64, Keyframe
 
 SURE_M = 0.3
 """If odometry's position is more certain than this (standard deviation), one place that fits is enough."""
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """Result of a search: contexts that were missing, from keyframe `first` on, and new or changed candidates."""
-
-    first: int = 0
-    contexts: tuple[ScanContext, ...] = ()
-    updates: tuple[LoopEdge, ...] = ()
 
 
 class Search:
@@ -54,8 +44,8 @@ class Search:
         self._params: list[LoopsParams] = []  # for each keyframe
         self._measured: list[Measured] = []
         self._loose: dict[int, Measured] = {}  # weakened odometry of keyframes before which it slipped
-        self._found: list[Found | None] = []  # for each keyframe; None until loops were looked for
-        self._ends: dict[int, Found] = {}  # found in addition at the session's end, by the number of keyframes
+        self._found: list[tuple[LoopEdge, ...] | None] = []  # at each keyframe; None until loops were looked for
+        self._ends: dict[int, tuple[LoopEdge, ...]] = {}  # also found at the session's end, by the number of keyframes
         self.graph = Graph(np.eye(4), 0)
 
     def __len__(self) -> int:
@@ -115,7 +105,7 @@ class Search:
             return
         count = len(self)
         if count not in self._ends:
-            self._ends[count] = self._look(range(self.detector.described, count))
+            self._ends[count] = self._look(range(max(count - self.detector.ahead, 0), count))
         self.finished = True
         self._take(self._ends[count])
 
@@ -125,9 +115,8 @@ class Search:
             raise HemislamError(f"The loop search knows {self.known} keyframes and cannot go to {count}.")
         if self.finished or count < len(self):
             self.finished = False
-            found = [one for one in self._found[:count] if one is not None]
-            self.detector.stand(count, [context for one in found for context in one.contexts])
-            self.found = {edge.pair: edge for one in found for edge in one.updates}
+            self.detector.go_to(count)
+            self.found = {edge.pair: edge for found in self._found[:count] for edge in found or ()}
         while len(self) < count:
             self._next()
 
@@ -155,12 +144,12 @@ class Search:
     def _next(self) -> None:
         """Go to the next keyframe of the history, and look for loops if that was not done yet."""
         index = len(self)
-        self.detector.go_on()
+        self.detector.go_to(index + 1)
         found = self._found[index]
         if found is None:
             self._look_for_slip(index - slips.REACH + 1)
             complete = index - self.detector.ahead
-            found = self._found[index] = self._look(range(max(complete, self.detector.described), complete + 1))
+            found = self._found[index] = self._look(range(max(complete, 0), complete + 1))
         self._take(found)
 
     def _look_for_slip(self, index: int) -> None:
@@ -170,19 +159,16 @@ class Search:
             assert measured.odometry is not None
             self._loose[index] = replace(measured, odometry=loosened(measured.odometry, slip.moved, after[:3, :3]))
 
-    def _take(self, found: Found) -> None:
-        self.detector.learn(found.contexts[self.detector.described - found.first :])
-        self.found.update((edge.pair, edge) for edge in found.updates)
+    def _take(self, found: Iterable[LoopEdge]) -> None:
+        self.found.update((edge.pair, edge) for edge in found)
 
-    def _look(self, keyframes: range) -> Found:
-        """Look for loops of some keyframes; those before the last that lack a context get one."""
+    def _look(self, keyframes: range) -> tuple[LoopEdge, ...]:
+        """Look for loops of some keyframes. Returns new candidates, and earlier ones with another verdict."""
         detector, now = self.detector, len(self) - 1
         params = self._params[now]
         if not params.enabled or not keyframes:
-            return Found()
-        first, drift = detector.described, Drift.of(params)
-        while detector.described < keyframes.stop:
-            detector.learn([detector.describe(detector.described)])
+            return ()
+        drift = Drift.of(params)
         poses, known = self.solved
         updates: dict[Pair, LoopEdge] = {}
         for newer in keyframes:
@@ -195,8 +181,7 @@ class Search:
                 settled = placed(settled, known.values(), detector.poses, poses, detector.pauses_before, detector.half)
             updates.update((edge.pair, edge) for edge in settled)
             known.update(updates)
-        contexts = tuple(detector.context(index) for index in range(first, keyframes.stop))
-        return Found(first, contexts, tuple(updates.values()))
+        return tuple(updates.values())
 
     def _judged(self, newer: int, expectation: Expectation, params: LoopsParams) -> list[LoopEdge]:
         """Candidates with a verdict on each alone."""
