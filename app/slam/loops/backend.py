@@ -83,7 +83,6 @@ class LoopBackend:
     def forget(self) -> None:
         """Forget the history beyond the present keyframe."""
         self._search.forget()
-        self._made = {key: edge for key, edge in self._made.items() if key[1] < len(self)}
 
     def stand(self, target: Target) -> None:
         """Go to a state. Raises as `load`, and then nothing has changed."""

@@ -107,13 +107,14 @@ class Detector:
         return np.cumsum(self.resumed)
 
     def take(self, keyframe: Keyframe) -> None:
-        """Store a new keyframe with its cloud; `go_to` goes to it."""
+        """Add a keyframe after the present one, which must be the last that was taken, and go to it."""
         self._heads.append(replace(keyframe, cloud=_NO_POINTS))
         self._poses = np.concatenate([self._poses, keyframe.T_odom_imu[None]])
         self._stamps = np.append(self._stamps, keyframe.stamp_ns)
         self._resumed = np.append(self._resumed, keyframe.resumed_ns > 0)
         self._astray = np.append(self._astray, keyframe.astray)
         self._submaps.append(keyframe)
+        self._count += 1
 
     def go_to(self, count: int) -> None:
         """Go to the first `count` keyframes that were taken."""

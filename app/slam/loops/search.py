@@ -5,7 +5,7 @@ the keyframes up to it, so each keyframe is searched once. To know where to look
 made of the loops as they were found.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +32,7 @@ class Search:
 
     Attributes:
         start: parameters that act on restart. detector: holds the keyframes.
-        found: candidates with the first `len` keyframes, with their verdicts; changed in place.
+        found: candidates with the first `len` keyframes, with their verdicts.
         finished: whether the session ends there. graph: without any edits.
     """
 
@@ -44,7 +44,7 @@ class Search:
         self._params: list[LoopsParams] = []  # for each keyframe
         self._measured: list[Measured] = []
         self._loose: dict[int, Measured] = {}  # weakened odometry of keyframes before which it slipped
-        self._found: list[tuple[LoopEdge, ...] | None] = []  # at each keyframe; None until loops were looked for
+        self._found: list[tuple[LoopEdge, ...]] = []  # when each keyframe came
         self._ends: dict[int, tuple[LoopEdge, ...]] = {}  # also found at the session's end, by the number of keyframes
         self.graph = Graph(np.eye(4), 0)
 
@@ -73,17 +73,17 @@ class Search:
         self.detector.close()
 
     def add(self, keyframe: Keyframe, params: LoopsParams, priors: tuple[PositionPrior, ...] = ()) -> None:
-        """Take the next keyframe, and look for loops of the newest one whose surroundings are complete.
+        """Take a keyframe, and look for loops of the newest one whose surroundings are complete.
 
-        If the same keyframe comes next in the history, nothing is computed again.
-        Raises HemislamError if one is missing.
+        If the history has another keyframe at this index, that one and all later ones are forgotten. If it has the same
+        one, nothing is computed again. Raises HemislamError if an earlier one is missing.
 
         Args:
             priors: what was measured of this keyframe alone.
         """
-        index = len(self)
-        if keyframe.index != index:
-            raise HemislamError(f"Keyframe {keyframe.index} cannot follow on {index} keyframes; one is missing.")
+        index = keyframe.index
+        if index > self.known:
+            raise HemislamError(f"Keyframe {index} cannot follow on {self.known} keyframes; one is missing.")
         self.go_to(index)
         if not self._is_known(keyframe, params):
             self.forget()
@@ -91,13 +91,15 @@ class Search:
                 self.detector.close()
                 self.start, self.detector = params, Detector(params)
                 self.graph = Graph(keyframe.T_odom_imu, params.window)
-            self.detector.take(keyframe)
-            before, after = self.detector.head(max(index - 1, 0)), self.detector.head(index)
-            odometry = odometry_factor(index, before, after, Drift.of(params)) if index else None
-            self._params.append(params)
+            drift = Drift.of(params)
+            odometry = odometry_factor(index, self.detector.head(index - 1), keyframe, drift) if index else None
             self._measured.append(Measured(odometry, priors))
-            self._found.append(None)
-        self._next()
+            self._params.append(params)
+            self.detector.take(keyframe)
+            self._look_for_slip(index - slips.REACH + 1)
+            complete = index - self.detector.ahead
+            self._found.append(self._look(range(max(complete, 0), complete + 1)))
+        self.go_to(index + 1)
 
     def finish(self) -> None:
         """The session ends here: look for loops of the last keyframes too. `add` and `go_to` take that back."""
@@ -107,18 +109,15 @@ class Search:
         if count not in self._ends:
             self._ends[count] = self._look(range(max(count - self.detector.ahead, 0), count))
         self.finished = True
-        self._take(self._ends[count])
+        self.found |= {edge.pair: edge for edge in self._ends[count]}
 
     def go_to(self, count: int) -> None:
         """Go to the state after `count` keyframes of the history. Raises HemislamError if it has fewer."""
         if not 0 <= count <= self.known:
             raise HemislamError(f"The loop search knows {self.known} keyframes and cannot go to {count}.")
-        if self.finished or count < len(self):
-            self.finished = False
-            self.detector.go_to(count)
-            self.found = {edge.pair: edge for found in self._found[:count] for edge in found or ()}
-        while len(self) < count:
-            self._next()
+        self.finished = False
+        self.detector.go_to(count)
+        self.found = {edge.pair: edge for found in self._found[:count] for edge in found}
 
     def forget(self) -> None:
         """Forget the history beyond the present keyframe."""
@@ -141,26 +140,12 @@ class Search:
             and np.array_equal(known.covariance, keyframe.covariance, equal_nan=True)
         )
 
-    def _next(self) -> None:
-        """Go to the next keyframe of the history, and look for loops if that was not done yet."""
-        index = len(self)
-        self.detector.go_to(index + 1)
-        found = self._found[index]
-        if found is None:
-            self._look_for_slip(index - slips.REACH + 1)
-            complete = index - self.detector.ahead
-            found = self._found[index] = self._look(range(max(complete, 0), complete + 1))
-        self._take(found)
-
     def _look_for_slip(self, index: int) -> None:
         """Look for a slip of odometry on the step to a keyframe, once the few keyframes after it have come."""
         if index > 0 and self.start.enabled and (slip := self.detector.slip(index)) is not None:
             measured, after = self._measured[index], self.detector.poses[index]
             assert measured.odometry is not None
             self._loose[index] = replace(measured, odometry=loosened(measured.odometry, slip.moved, after[:3, :3]))
-
-    def _take(self, found: Iterable[LoopEdge]) -> None:
-        self.found.update((edge.pair, edge) for edge in found)
 
     def _look(self, keyframes: range) -> tuple[LoopEdge, ...]:
         """Look for loops of some keyframes. Returns new candidates, and earlier ones with another verdict."""

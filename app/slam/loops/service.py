@@ -48,10 +48,8 @@ class LoopService:
 
     def add(self, request: AddKeyframe) -> Added:
         """Raises HemislamError if a keyframe before it is missing."""
-        backend = self._backend
-        backend.go_to(min(request.keyframe.index, backend.known))
-        backend.add(request.keyframe, request.params)
-        return Added(len(backend))
+        self._backend.add(request.keyframe, request.params)
+        return Added(len(self._backend))
 
     def answer(self, ask: Ask) -> Answer:
         """Raises HemislamError if it cannot be done."""

@@ -142,7 +142,6 @@ def both(there: F64, here: F64, T_there_here: F64) -> tuple[Prepared, Prepared]:
         cloud = Cloud(points.astype(np.float32), np.zeros(n, np.uint8), np.zeros(n, np.float32), np.zeros(n, np.uint16),
             np.zeros(n, np.int32))  # fmt: skip
         detector.take(Keyframe(index, index, index, np.eye(4), np.eye(4), np.eye(6), cloud))
-        detector.go_to(index + 1)
     return detector.both(0, 1)
 
 
