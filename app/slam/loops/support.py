@@ -54,18 +54,17 @@ def settle(
     """
     walked = walked_m(poses[:, :3, 3]) + pauses_before * ELSEWHERE_M
 
-    def ways(a: LoopEdge, b: LoopEdge) -> tuple[float, float]:
-        return abs(float(walked[a.older] - walked[b.older])), abs(float(walked[a.newer] - walked[b.newer]))
-
     alive = [edge for edge in edges.values() if edge.verdict is not Verdict.REJECTED or edge.evidence.ambiguous]
     apart = np.abs(_ends(alive, walked)[:, None] - _ends(fresh.values(), walked)).max(axis=2)
     near = [alive[index] for index in np.flatnonzero((apart < NEIGHBOURHOOD_M).any(axis=1))]
-    out = dict(fresh)
-    for edge in near:
+    ends, out = _ends(near, walked), dict(fresh)
+    for edge, own in zip(near, ends, strict=True):
         if edge.verdict is not Verdict.CANDIDATE or edge.edited:
             continue
-        others = [o for o in near if o.pair != edge.pair and max(ways(edge, o)) < NEIGHBOURHOOD_M]
-        agree = _agree(edge, others, poses, np.array([sum(ways(edge, o)) for o in others]), drift) if others else ()
+        ways = np.abs(ends - own)
+        around = np.flatnonzero(ways.max(axis=1) < NEIGHBOURHOOD_M)  # and itself, which agrees and adds no support
+        others = [near[index] for index in around]
+        agree = _agree(edge, others, poses, ways[around].sum(axis=1), drift)
         # an ambiguous loop that agrees is no support: all that is seen there may belong to a place that looks the same
         agreeing = [o.newer for o, yes in zip(others, agree, strict=True) if yes and not o.evidence.ambiguous]
         contradicting = [o.pair for o, yes in zip(others, agree, strict=True) if not yes]
