@@ -13,7 +13,7 @@ import numpy as np
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
-from app.slam.loops.edits import Add, Edits, LoopEdit, Override, Solve, apply_edits, check, in_words, rows
+from app.slam.loops.edits import Add, Edits, LoopEdit, Solve, apply_edits, check, in_words, rows
 from app.slam.loops.factors import Closing, PositionPrior, residuals
 from app.slam.loops.messages import Target
 from app.slam.loops.pose_graph import Graph, failure, optimum
@@ -148,16 +148,9 @@ class LoopBackend:
     # --- edits -----------------------------------------------------------------------------------
     def apply(self, edit: LoopEdit) -> None:
         """Add an edit. Those undone before can no longer be redone. Raises HemislamError if it makes no sense."""
-        check(edit)
-        if isinstance(edit, Add):
-            there = edit.newer < len(self)
-            if there and edit.guess is None:  # the present guess, so that repeating the edit gives the same
-                edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
-            self._check_made(edit)
-        else:
-            there = edit.pair is None or edit.pair in self.by_pair
+        edit = self._ready(edit)
         self.load(Edits((*self.edits.done, edit)))
-        if not there:
+        if edit.pair and edit.pair not in self.by_pair:
             self._notices.append(f"{in_words(edit)} waits until there is such a loop.")
 
     def load(self, edits: Edits) -> None:
@@ -176,25 +169,31 @@ class LoopBackend:
         Raises:
             HemislamError: it makes no sense, or there is no such loop or keyframe yet.
         """
-        check(edit)
-        if not isinstance(edit, Solve | Override):
-            self._check_there(edit.older, edit.newer)
+        edit = self._ready(edit)
+        if edit.pair:
+            older, newer = edit.pair
+            self._check_there(older, newer)
             if not isinstance(edit, Add) and edit.pair not in self.by_pair:
-                raise HemislamError(f"There is no loop candidate of keyframes {edit.older} and {edit.newer}.")
-        if isinstance(edit, Add) and edit.guess is None:
-            edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
-        self._check_made(edit)
+                raise HemislamError(f"There is no loop candidate of keyframes {older} and {newer}.")
         factors = self._factors(self._edited.sound(self._with_edits((*self.edits.done, edit))))
         poses = optimum(self._solved()[0], factors)
         return Preview(poses, residuals(factors, poses))
 
-    def _check_made(self, edit: LoopEdit) -> None:
-        """Raises HemislamError if the edit adds a loop by hand whose registration found nothing in common."""
-        if isinstance(edit, Add) and edit.register and edit.newer < len(self) and not self._make(edit).evidence.overlap:
-            raise HemislamError(
-                f"The surroundings of keyframes {edit.older} and {edit.newer} have nothing in common from there;"
-                " nudge one nearer to where it belongs, or tie them without registration."
-            )
+    def _ready(self, edit: LoopEdit) -> LoopEdit:
+        """The edit, with the present guess if it adds a loop without one, so that repeating it gives the same.
+
+        Raises HemislamError if it makes no sense, or adds a loop whose registration finds nothing in common.
+        """
+        check(edit)
+        if isinstance(edit, Add) and edit.newer < len(self):
+            if edit.guess is None:
+                edit = replace(edit, guess=rows(self._present(edit.older, edit.newer)))
+            if edit.register and not self._make(edit).evidence.overlap:
+                raise HemislamError(
+                    f"The surroundings of keyframes {edit.older} and {edit.newer} have nothing in common from there;"
+                    " nudge one nearer to where it belongs, or tie them without registration."
+                )
+        return edit
 
     def _make(self, edit: Add) -> LoopEdge:
         """The loop by hand between existing keyframes, registered by as much of their surroundings as there is."""
