@@ -60,7 +60,7 @@ class Walk:
     ) -> Session:
         session = open_session(path, params, *(part or (0.0, None)), truth=truth, checkpoint_bytes=BUDGET)
         if session.loops is not None:
-            session.loops.wait_ready()
+            session.loops.results()  # waits for the process to start
         return session
 
     def do(self, command: Command) -> Snapshot:

@@ -103,7 +103,7 @@ def cost(path: Path, budget: int, frames: int | None = None) -> list[Line]:
     checkpoints = _Timed(budget)
     session = Session(FileFeed(path, params), Engine(params), loops=RestartingLoops, checkpoints=checkpoints)
     if session.loops:
-        session.loops.wait_ready()
+        session.loops.results()  # waits for the process to start
     checkpoints.seconds = 0.0
     with tqdm(desc="Checkpoints", total=frames, unit=" frames", leave=False, disable=None) as bar:
         while (entry := session.peek()) is not None and (frames is None or session.frame < frames):

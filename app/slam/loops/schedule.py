@@ -33,7 +33,7 @@ from app.slam.loops.messages import (
     Question,
     Target,
 )
-from app.slam.loops.types import LoopEdge, Verdict, difference
+from app.slam.loops.types import LoopEdge, Verdict
 from app.slam.map_frame import MapFrame
 from app.slam.sections import LoopsParams
 from app.slam.types import I64, Keyframe
@@ -132,8 +132,7 @@ class LoopSchedule:
         if before is self._reported:
             return ()
         verdicts = {edge.pair: edge.verdict for edge in before}
-        changed = difference(before, self._reported).changed
-        return tuple(edge for edge in changed if verdicts.get(edge.pair) is not edge.verdict)
+        return tuple(edge for edge in self._reported if verdicts.get(edge.pair) is not edge.verdict)
 
     def add(self, keyframe: Keyframe, params: LoopsParams) -> None:
         """The session has a new keyframe, or comes to a known one again."""
@@ -176,11 +175,6 @@ class LoopSchedule:
         self._finished = True
         self._requests.append(AskState())
         self._ask_next()
-
-    def wait_ready(self) -> None:
-        """Wait until the client answers, so that no frame has to: a process takes a second to start."""
-        self._ask(Ask(Target(0, self._edits)))
-        self._settle()
 
     # --- the user --------------------------------------------------------------------------------
     def command(self, request: UserRequest) -> None:
