@@ -29,12 +29,11 @@ FAR_M = 40.0
 """Reach of submaps where little stands upright nearby, as on a plaza."""
 WIDER = 2.0
 """Odometry that slipped is farther off than the drift model allows, so the search reaches this many times as far."""
-KEPT_PREPARED = 8
-"""Submaps that stay in memory, ready for registration: the newer one, and older ones, which are often met again."""
+KEPT_PREPARED = 16
+"""Submaps that stay in memory, ready for registration: the newer one, older ones, which are often met again, and clouds
+on one side of a step: `slips.REACH` steps later, they are on the other side."""
 KEPT_SUBMAPS = 1
 """Other submaps that stay in memory: the one just described is needed again."""
-KEPT_PIECES = 2 * slips.REACH
-"""Clouds on one side of a step that stay in memory: `slips.REACH` steps later, they are on the other side."""
 _NUMBERS = np.empty(0, np.float32)
 _NO_POINTS = Cloud(_NUMBERS, np.empty(0, np.uint8), _NUMBERS, np.empty(0, np.uint16), np.empty(0, np.int32))
 
@@ -67,10 +66,10 @@ class Detector:
         self.half = params.submap_keyframes
         self.ahead = self.half + slips.REACH - 1
         self._submaps = Submaps(params.submap_voxel, scan_context.RADIUS, FAR_M)
-        self._around = lru_cache(KEPT_SUBMAPS)(lambda *key: self._submaps.around(key[0], self._poses, *key[1:]))
+        self._around = lru_cache(KEPT_SUBMAPS)(
+            lambda index, first, last, far=False: self._submaps.around(index, self._poses, first, last, far=far)
+        )
         self._prepared = lru_cache(KEPT_PREPARED)(lambda *key: verification.prepare(self._around(*key)))
-        self._wide = lru_cache(KEPT_PREPARED)(self._far_submap)
-        self._pieces = lru_cache(KEPT_PIECES)(self._piece)
         self._slips: dict[tuple[int, int], Slip | None] = {}
         self._heads: list[Keyframe] = []
         self._poses = np.empty((0, 4, 4))
@@ -131,8 +130,6 @@ class Detector:
         del self._contexts[max(len(self) - self.half, 0) :]
         self._around.cache_clear()
         self._prepared.cache_clear()
-        self._wide.cache_clear()
-        self._pieces.cache_clear()
         self._slips.clear()
 
     def close(self) -> None:
@@ -152,7 +149,7 @@ class Detector:
         after = range(index + 1, self.last(index, self.half) + 1)
         first = next((k for k in before if self.slip(k) is not None), before.stop)
         end = next((k for k in after if self.slip(k) is not None), after.stop) - 1
-        return (self._wide if wide else self._prepared)(index, first, end)
+        return self._prepared(index, first, end, wide)
 
     def slip(self, index: int) -> Slip | None:
         """How odometry slipped on the step to a keyframe, from the few keyframes on each side; see `slips`.
@@ -163,7 +160,7 @@ class Detector:
             return None
         first, last = self._first(index, slips.REACH), self.last(index, slips.REACH - 1)
         if (index, last) not in self._slips:
-            before, after = self._pieces(first, index - 1), self._pieces(index, last)
+            before, after = self._prepared(first, first, index - 1), self._prepared(index, index, last)
             self._slips[index, last] = slips.slip(before, after, self.guess(first, index, self._poses))
         return self._slips[index, last]
 
@@ -264,12 +261,6 @@ class Detector:
     def _describe(self, index: int) -> ScanContext:
         first, last = self._first(index, self.half), self.last(index, self.half)
         return scan_context.describe(self._around(index, first, last).points)
-
-    def _far_submap(self, index: int, first: int, last: int) -> Prepared:
-        return verification.prepare(self._submaps.around(index, self._poses, first, last, far=True))
-
-    def _piece(self, first: int, last: int) -> Prepared:
-        return verification.prepare(self._submaps.around(first, self._poses, first, last))
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:
