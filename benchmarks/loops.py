@@ -11,11 +11,12 @@ from tqdm import tqdm
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.slam.engine import Engine
+from app.slam.loops.backend import LoopBackend
 from app.slam.loops.edits import Reject
 from app.slam.loops.factors import Factor, residuals
 from app.slam.loops.messages import AddKeyframe, ApplyEdit, Ask, LoopState, Target
 from app.slam.loops.pose_graph import PoseGraph
-from app.slam.loops.service import LoopService, warm_up
+from app.slam.loops.service import warm_up
 from app.slam.loops.solvers import optimise
 from app.slam.loops.types import Verdict
 from app.slam.params import Params
@@ -80,12 +81,12 @@ def _search() -> list[Line]:
     keyframes = _keyframes(path, params)
     every_ms = np.median(np.diff([keyframe.stamp_ns for keyframe in keyframes])) / 1e6
     warm_up()
-    service, times = LoopService(), []
+    backend, times = LoopBackend(), []
     state = None
     for keyframe in tqdm(keyframes, desc="Loops", unit=" keyframes", leave=False, disable=None):
         begin = time.perf_counter()
-        service.handle(AddKeyframe(keyframe, params.loops))
-        reply = service.handle(Ask(Target(keyframe.index + 1)))
+        backend.handle(AddKeyframe(keyframe, params.loops))
+        reply = backend.handle(Ask(Target(keyframe.index + 1)))
         times.append((time.perf_counter() - begin) * 1e3)
         state = reply if isinstance(reply, LoopState) else state
     assert state is not None
@@ -95,9 +96,9 @@ def _search() -> list[Line]:
         target = Target(len(keyframes))
         for request in (Ask(target, ApplyEdit(Reject(*edge.pair))), Ask(target)):
             begin = time.perf_counter()
-            service.handle(request)
+            backend.handle(request)
             undoing.append((time.perf_counter() - begin) * 1e3)
-    service.close()
+    backend.close()
     on = f"building in laps: {len(keyframes):,} keyframes, {len(accepted)} loops, one each {every_ms:.0f} ms"
     return [Line.of("loop search of a keyframe", on, "ms", times), Line.of("editing and undoing", on, "ms", undoing)]
 

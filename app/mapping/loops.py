@@ -127,13 +127,14 @@ def main(owner: Link) -> None:
     """The process: answers requests in their order."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)
-    from app.slam.loops.service import LoopService, warm_up  # the owner does not need the solver
+    from app.slam.loops.backend import LoopBackend  # the owner does not need the solver
+    from app.slam.loops.service import warm_up
 
     warm_up()
-    service = LoopService()
+    backend = LoopBackend()
     edges: tuple[LoopEdge, ...] = ()
     while True:
-        reply = service.handle(owner.receive())
+        reply = backend.handle(owner.receive())
         if isinstance(reply, LoopState):
             change, edges = difference(edges, reply.edges), reply.edges
             owner.send((replace(reply, edges=()), change))

@@ -15,9 +15,9 @@ from app.child import Child, ChildDied, Link
 from app.mapping.loops import MOST_DEATHS, MOST_PENDING, LoopProcess
 from app.slam import lie
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.backend import LoopBackend
 from app.slam.loops.edits import Accept, Add, Edits, LoopEdit, Reject, rows
 from app.slam.loops.messages import Added, AddKeyframe, ApplyEdit, Ask, Failure, LoopState, Request, Target
-from app.slam.loops.service import LoopService
 from app.slam.loops.types import difference
 from app.slam.sections import LoopsParams
 from app.slam.types import NON_GROUND, Cloud, Keyframe
@@ -90,7 +90,7 @@ def test_it_answers_as_one_in_this_process_would(either: LoopProcess) -> None:
         Ask(Target(8)),
     ]
     requests += [Ask(Target(4)), Ask(Target(5)), Ask(Target(5), ApplyEdit(Reject(3, 3)))]
-    inline = LoopService()
+    inline = LoopBackend()
     for request in requests:
         process.send(request)
     found = 0

@@ -15,7 +15,22 @@ from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edits import Add, Edits, LoopEdit, Solve, apply_edits, check, in_words, rows
 from app.slam.loops.factors import Closing, PositionPrior, residuals
-from app.slam.loops.messages import Target
+from app.slam.loops.messages import (
+    Added,
+    Answer,
+    Answered,
+    ApplyEdit,
+    Ask,
+    AskG2o,
+    AskResiduals,
+    Failure,
+    Inspect,
+    LoopState,
+    Reply,
+    Request,
+    Target,
+    TryOut,
+)
 from app.slam.loops.pose_graph import Graph, failure, optimum
 from app.slam.loops.search import Search
 from app.slam.loops.solvers import g2o_text
@@ -84,7 +99,46 @@ class LoopBackend:
         """Forget the history beyond the present keyframe."""
         self._search.forget()
 
-    def stand(self, target: Target) -> None:
+    # --- requests --------------------------------------------------------------------------------
+    def handle(self, request: Request) -> Reply:
+        """The reply to a request. One that cannot be met gives a `Failure`, never an exception."""
+        if isinstance(request, Ask):
+            return self.answer(request)
+        try:
+            self.add(request.keyframe, request.params)
+            return Added(len(self))
+        except HemislamError as error:
+            return Failure(str(error))
+
+    def answer(self, ask: Ask) -> Answer:
+        """The answer to a question; a `Failure` if it cannot be done."""
+        question = ask.question
+        try:
+            self._stand(ask.target)
+            match question:
+                case TryOut(edit):
+                    return Answered(question, self.preview(edit))
+                case Inspect(older, newer):
+                    return Answered(question, self.detail(older, newer))
+                case AskResiduals():
+                    return Answered(question, self.factor_residuals())
+                case AskG2o():
+                    return Answered(question, self.g2o())
+                case ApplyEdit(edit):
+                    self.apply(edit)
+        except HemislamError as error:
+            return Failure(str(error))
+        return LoopState(
+            count=len(self),
+            finished=self.finished,
+            corrections=self.corrections,
+            edges=self.edges,
+            undo=self.edits.done,
+            redo=self.edits.undone,
+            notices=self.take_notices(),
+        )
+
+    def _stand(self, target: Target) -> None:
         """Go to a state. Raises as `load`, and then nothing has changed."""
         self.load(target.edits)
         count = min(target.count, self.known)
@@ -107,11 +161,13 @@ class LoopBackend:
 
     @property
     def corrections(self) -> F64:
-        """(k, 4, 4) T_map_odom at each keyframe; identity while nothing corrects odometry."""
+        """(k, 4, 4) T_map_odom at each keyframe, read-only; identity while nothing corrects odometry."""
+        corrections = np.tile(np.eye(4), (len(self), 1, 1))
         measured = any(measured.priors for measured in self._search.measured)
         if measured or Solve() in self.edits.done or any(edge.counts for edge in self.edges):
-            return np.asarray(self.poses @ lie.inverse(self._odometry))
-        return np.tile(np.eye(4), (len(self), 1, 1))
+            corrections = np.asarray(self.poses @ lie.inverse(self._odometry))
+        corrections.setflags(write=False)
+        return corrections
 
     @property
     def edges(self) -> tuple[LoopEdge, ...]:

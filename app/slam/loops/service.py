@@ -1,85 +1,20 @@
-"""The loop back end behind a single method, and the client that runs it in the caller's own process."""
+"""The client that runs the loop back end in the caller's own process, and the loading of all that a back end needs."""
 
 from collections import deque
 
 import numpy as np
 
-from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import placing, scan_context, verification
 from app.slam.loops.backend import LoopBackend
 from app.slam.loops.drift import Deviation
 from app.slam.loops.factors import Factor
 from app.slam.loops.keyframe_log import Follower, KeyframeLog
-from app.slam.loops.messages import (
-    Added,
-    AddKeyframe,
-    Answer,
-    Answered,
-    ApplyEdit,
-    Ask,
-    AskG2o,
-    AskResiduals,
-    Failure,
-    Inspect,
-    LoopState,
-    Reply,
-    Request,
-    TryOut,
-)
+from app.slam.loops.messages import Answer, Ask
 from app.slam.loops.plan import Window
 from app.slam.loops.pose_graph import PoseGraph
 from app.slam.loops.submap import Submap
 from app.slam.voxel import VoxelGrid
-
-
-class LoopService:
-    """Answers requests, one after the other; deterministic."""
-
-    def __init__(self) -> None:
-        self._backend = LoopBackend()
-
-    def handle(self, request: Request) -> Reply:
-        """The answer. A request that cannot be met gives a `Failure`, never an exception."""
-        try:
-            return self.add(request) if isinstance(request, AddKeyframe) else self.answer(request)
-        except HemislamError as error:
-            return Failure(str(error))
-
-    def add(self, request: AddKeyframe) -> Added:
-        """Raises HemislamError if a keyframe before it is missing."""
-        self._backend.add(request.keyframe, request.params)
-        return Added(len(self._backend))
-
-    def answer(self, ask: Ask) -> Answer:
-        """Raises HemislamError if it cannot be done."""
-        backend, question = self._backend, ask.question
-        backend.stand(ask.target)
-        match question:
-            case TryOut(edit):
-                return Answered(question, backend.preview(edit))
-            case Inspect(older, newer):
-                return Answered(question, backend.detail(older, newer))
-            case AskResiduals():
-                return Answered(question, backend.factor_residuals())
-            case AskG2o():
-                return Answered(question, backend.g2o())
-            case ApplyEdit(edit):
-                backend.apply(edit)
-        corrections = backend.corrections
-        corrections.setflags(write=False)
-        return LoopState(
-            count=len(backend),
-            finished=backend.finished,
-            corrections=corrections,
-            edges=backend.edges,
-            undo=backend.edits.done,
-            redo=backend.edits.undone,
-            notices=backend.take_notices(),
-        )
-
-    def close(self) -> None:
-        self._backend.close()
 
 
 class InlineLoops:
@@ -88,17 +23,14 @@ class InlineLoops:
     catching_up = False
 
     def __init__(self, log: KeyframeLog) -> None:
-        self._service = LoopService()
+        self._backend = LoopBackend()
         self._follower = Follower(log)
         self._answers: deque[Answer] = deque()
 
     def send(self, ask: Ask) -> None:
         while (keyframe := self._follower.next(ask.target)) is not None:
-            self._service.add(keyframe)
-        try:
-            self._answers.append(self._service.answer(ask))
-        except HemislamError as error:
-            self._answers.append(Failure(str(error)))
+            self._backend.add(keyframe.keyframe, keyframe.params)
+        self._answers.append(self._backend.answer(ask))
 
     def receive(self, timeout: float | None = None) -> Answer | None:
         return self._answers.popleft() if self._answers else None
@@ -107,7 +39,7 @@ class InlineLoops:
         return []
 
     def close(self) -> None:
-        self._service.close()
+        self._backend.close()
 
 
 def warm_up() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from app.slam.keyframes import KeyframeStore
+from app.slam.loops.backend import LoopBackend
 from app.slam.loops.edits import Accept, Add, Edits, Reject, Solve
 from app.slam.loops.keyframe_log import KeyframeEntry, KeyframeLog
 from app.slam.loops.messages import (
@@ -24,7 +25,7 @@ from app.slam.loops.messages import (
     Target,
     TryOut,
 )
-from app.slam.loops.service import InlineLoops, LoopService
+from app.slam.loops.service import InlineLoops
 from app.slam.loops.types import LoopDetail, Preview, Verdict, difference
 from tests.slam.loops.conftest import PARAMS, Walked, same
 
@@ -33,15 +34,15 @@ ALL = 10_000
 
 
 @pytest.fixture(scope="module")
-def service(walked: Walked) -> LoopService:
-    service = LoopService()
+def backend(walked: Walked) -> LoopBackend:
+    backend = LoopBackend()
     for keyframe in walked.keyframes:
-        assert service.handle(AddKeyframe(keyframe, PARAMS)) == Added(keyframe.index + 1)
-    return service
+        assert backend.handle(AddKeyframe(keyframe, PARAMS)) == Added(keyframe.index + 1)
+    return backend
 
 
-def state(service: LoopService, target: Target, *question: Question) -> LoopState:
-    reply = service.handle(Ask(target, *question))
+def state(backend: LoopBackend, target: Target, *question: Question) -> LoopState:
+    reply = backend.handle(Ask(target, *question))
     assert isinstance(reply, LoopState), reply
     return reply
 
@@ -50,23 +51,23 @@ def end(edits: Edits = Edits()) -> Target:  # noqa: B008 - a value
     return Target(ALL, edits, finished=True)
 
 
-def test_corrections_take_odometry_to_the_map(walked: Walked, service: LoopService) -> None:
-    last = state(service, end())
+def test_corrections_take_odometry_to_the_map(walked: Walked, backend: LoopBackend) -> None:
+    last = state(backend, end())
     assert last.finished
     assert last.count == len(walked.keyframes)
     odometry = np.array([keyframe.T_odom_imu for keyframe in walked.keyframes])
     np.testing.assert_allclose(last.corrections @ odometry, walked.poses[-1], atol=1e-9)
     assert not last.corrections.flags.writeable
-    assert state(LoopService(), Target(0)).corrections.shape == (0, 4, 4)
+    assert state(LoopBackend(), Target(0)).corrections.shape == (0, 4, 4)
 
 
-def test_the_same_question_has_the_same_answer_whatever_was_asked_before(walked: Walked, service: LoopService) -> None:
+def test_the_same_question_has_the_same_answer_whatever_was_asked_before(walked: Walked, backend: LoopBackend) -> None:
     half = walked.halfway
     edge = next(edge for edge in walked.edges[half - 1] if edge.verdict is Verdict.ACCEPTED)
     targets = (Target(half), Target(half, Edits((Reject(*edge.pair),))), end(), Target(half + 1))
-    first = [state(service, target) for target in targets]
+    first = [state(backend, target) for target in targets]
     for target, before in reversed(list(zip(targets, first, strict=True))):
-        after = state(service, target)
+        after = state(backend, target)
         assert (after.count, after.finished, after.undo) == (before.count, before.finished, before.undo)
         assert after.corrections.tobytes() == before.corrections.tobytes()
         assert same(after.edges, before.edges)
@@ -75,25 +76,25 @@ def test_the_same_question_has_the_same_answer_whatever_was_asked_before(walked:
 
 
 def test_differences_of_states_add_up_to_all_edges(walked: Walked) -> None:
-    service, edges = LoopService(), {}
+    backend, edges = LoopBackend(), {}
     before: LoopState | None = None
     for keyframe in walked.keyframes:
-        service.handle(AddKeyframe(keyframe, PARAMS))
-        now = state(service, Target(ALL))
+        backend.handle(AddKeyframe(keyframe, PARAMS))
+        now = state(backend, Target(ALL))
         change = difference(before.edges if before else (), now.edges)
         assert change.gone == ()
         edges.update((edge.pair, edge.verdict) for edge in change.changed)
         assert edges == {edge.pair: edge.verdict for edge in now.edges}
         before = now
     assert Verdict.ACCEPTED in edges.values()
-    service.close()
+    backend.close()
 
 
-def test_questions_change_nothing(service: LoopService) -> None:
-    before = state(service, end())
+def test_questions_change_nothing(backend: LoopBackend) -> None:
+    before = state(backend, end())
     edge = next(edge for edge in before.edges if edge.verdict is Verdict.ACCEPTED)
     questions = (TryOut(Reject(*edge.pair)), Inspect(*edge.pair), AskResiduals(), TryOut(Solve()), AskG2o())
-    replies = [service.handle(Ask(end(), question)) for question in questions]
+    replies = [backend.handle(Ask(end(), question)) for question in questions]
     assert [reply.question for reply in replies if isinstance(reply, Answered)] == list(questions)
     tried, inspected, residuals, solved, g2o = (reply.value for reply in replies if isinstance(reply, Answered))
     assert isinstance(tried, Preview) and isinstance(solved, Preview)
@@ -104,65 +105,65 @@ def test_questions_change_nothing(service: LoopService) -> None:
     loops = sum(edge.counts for edge in before.edges)
     assert len(residuals) == before.count - 1 + loops
     assert g2o.count("\nEDGE_SE3:QUAT") == before.count - 1 + loops
-    after = state(service, end())
+    after = state(backend, end())
     assert after.corrections.tobytes() == before.corrections.tobytes()
     assert after.edges == before.edges
     assert after.undo == after.notices == ()
 
 
-def test_an_edit_is_answered_by_what_became_of_it(service: LoopService) -> None:
-    before = state(service, end())
+def test_an_edit_is_answered_by_what_became_of_it(backend: LoopBackend) -> None:
+    before = state(backend, end())
     edge = next(edge for edge in before.edges if edge.verdict is Verdict.ACCEPTED)
-    rejected = state(service, end(), ApplyEdit(Reject(*edge.pair)))
+    rejected = state(backend, end(), ApplyEdit(Reject(*edge.pair)))
     assert (edge.pair, Verdict.REJECTED) in {
         (e.pair, e.verdict) for e in difference(before.edges, rejected.edges).changed
     }
     assert rejected.undo == (Reject(*edge.pair),)
-    undone = state(service, end(Edits(rejected.undo).undo()))
+    undone = state(backend, end(Edits(rejected.undo).undo()))
     assert (undone.undo, undone.redo) == ((), rejected.undo)
     assert undone.corrections.tobytes() == before.corrections.tobytes()
-    redone = state(service, end(Edits(rejected.undo)))
+    redone = state(backend, end(Edits(rejected.undo)))
     assert redone.corrections.tobytes() == rejected.corrections.tobytes()
 
 
-def test_an_edit_that_waits_says_so(service: LoopService) -> None:
-    waiting = state(service, end(), ApplyEdit(Accept(1, 2)))
+def test_an_edit_that_waits_says_so(backend: LoopBackend) -> None:
+    waiting = state(backend, end(), ApplyEdit(Accept(1, 2)))
     assert waiting.notices == ("Accept 1-2 waits until there is such a loop.",)
-    assert state(service, end()).notices == ()
+    assert state(backend, end()).notices == ()
 
 
-def test_what_cannot_be_done_is_said_and_changes_nothing(walked: Walked, service: LoopService) -> None:
-    before = state(service, end())
+def test_what_cannot_be_done_is_said_and_changes_nothing(walked: Walked, backend: LoopBackend) -> None:
+    before = state(backend, end())
     questions: list[tuple[Question, str]] = [
         (ApplyEdit(Add(9, 2)), "older and a newer"),
         (TryOut(Accept(1, 2)), "no loop candidate"),
         (Inspect(0, 10_000), "of the"),
     ]
     for question, text in questions:
-        reply = service.handle(Ask(end(), question))
+        reply = backend.handle(Ask(end(), question))
         assert isinstance(reply, Failure)
         assert text in reply.text
-    reply = service.handle(Ask(end(Edits((Accept(9, 2),)))))
+    reply = backend.handle(Ask(end(Edits((Accept(9, 2),)))))
     assert isinstance(reply, Failure) and "older and a newer" in reply.text
-    few = LoopService()
+    few = LoopBackend()
     reply = few.handle(AddKeyframe(walked.keyframes[3], PARAMS))
     assert isinstance(reply, Failure) and "cannot follow" in reply.text
     few.close()
-    after = state(service, end())
+    after = state(backend, end())
     assert (after.count, after.undo) == (before.count, before.undo)
     assert after.corrections.tobytes() == before.corrections.tobytes()
 
 
 def test_a_keyframe_at_a_known_index_replaces_it_and_all_later_ones_unless_it_is_the_same(walked: Walked) -> None:
-    service = LoopService()
+    backend = LoopBackend()
     for keyframe in walked.keyframes[:6]:
-        service.handle(AddKeyframe(keyframe, PARAMS))
-    assert service.handle(AddKeyframe(walked.keyframes[3], PARAMS)) == Added(4)
-    assert state(service, Target(ALL)).count == 6
+        backend.handle(AddKeyframe(keyframe, PARAMS))
+    assert backend.handle(AddKeyframe(walked.keyframes[3], PARAMS)) == Added(4)
+    assert state(backend, Target(ALL)).count == 6
     other = PARAMS.model_copy(update={"min_time": PARAMS.min_time + 1})
-    service.handle(AddKeyframe(walked.keyframes[3], other))
-    assert state(service, Target(ALL)).count == 4
-    service.close()
+    backend.handle(AddKeyframe(walked.keyframes[3], other))
+    assert state(backend, Target(ALL)).count == 4
+    backend.close()
 
 
 def test_inline_loops_follow_the_log_and_answer_in_order(walked: Walked) -> None:
