@@ -20,7 +20,7 @@ by its number, or a control point by its name: `point P1`.
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, fields
 from typing import Annotated, Any, Final
 
 import yaml
@@ -29,7 +29,6 @@ from pydantic import Strict, TypeAdapter, ValidationError
 from app.slam.errors import HemislamError
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.edits import Accept, Add, LoopEdit, Override, Reject, SetWeight, Solve, check
-from app.slam.loops.types import Pair
 from app.slam.user_text import read_yaml
 
 _VERBS: Final[dict[str, Any]] = {
@@ -38,22 +37,14 @@ _VERBS: Final[dict[str, Any]] = {
 _AT_ONCE: Final = "at once"
 
 
-@dataclass
-class _Values:
-    weight: Annotated[float, Strict()] = 1.0
-    register: Annotated[bool, Strict()] = True
-    guess: tuple[tuple[float, ...], ...] | None = None
-    accepted: Annotated[bool, Strict()] = True
-
-
-_VALUES: Final = TypeAdapter(_Values)
-_NEEDED: Final[dict[str, dict[str, Any]]] = {"weigh": {"weight": None}, "override": {"accepted": None}}
-_MUST_BE: Final = {
-    "weight": "a number greater than 0",
-    "register": "true or false",
-    "guess": "a 4x4 matrix of numbers",
-    "accepted": "true or false",
+_SWITCH: Final = TypeAdapter(Annotated[bool, Strict()]), "true or false"
+_VALUES: Final[dict[str, tuple[TypeAdapter[Any], str]]] = {
+    "weight": (TypeAdapter(Annotated[float, Strict()]), "a number greater than 0"),
+    "register": _SWITCH,
+    "guess": (TypeAdapter(tuple[tuple[float, ...], ...] | None), "a 4x4 matrix of numbers"),
+    "accepted": _SWITCH,
 }
+"""What an entry may hold beside its verb, and what that must be."""
 _EXAMPLE: Final = "write entries such as `- accept: [12, 340]`"
 _HEAD: Final = "# Edits of loops, in their order: hemislam run RECORDING --loops THIS_FILE\n"
 
@@ -97,7 +88,7 @@ def _entry(edit: LoopEdit) -> dict[str, Any]:
     if isinstance(edit, Override):
         return {verb: edit.what, "accepted": edit.accepted}
     pair = [int(one) if one < KeyframeId(1, 0) else str(one) for one in edit.pair or ()]
-    values = {name: getattr(edit, name) for name in _names(type(edit))}
+    values = {name: getattr(edit, name) for name in _values(type(edit))}
     if guess := values.pop("guess", None):
         values["guess"] = [list(row) for row in guess]
     return {verb: pair or _AT_ONCE} | values
@@ -111,42 +102,39 @@ def _edit(entry: object) -> LoopEdit:
             f" {_AT_ONCE}`; or `override: fix 12`."
         )
     (verb,) = verbs
-    entry = {name: value for name, value in entry.items() if name != "since"}  # older files hold it; it added nothing
-    known = _names(_VERBS[verb])
-    if unknown := sorted(str(name) for name in entry.keys() - {verb, *known}):
-        raise HemislamError(f"{verb} has no {unknown[0]}; it takes {' and '.join(known) or 'nothing else'}.")
-    given = _NEEDED.get(verb, {}) | {name: entry[name] for name in entry if name != verb}
-    try:
-        read = _VALUES.validate_python(given)
-    except ValidationError as error:
-        name = str(error.errors()[0]["loc"][0])
-        raise HemislamError(f"{name} is {given[name]!r}; it must be {_MUST_BE[name]}.") from None
-    if verb == "solve" and entry[verb] != _AT_ONCE:
-        raise HemislamError(f"solve is {entry[verb]!r}; it can only be `{_AT_ONCE}`.")
-    edit: LoopEdit = _VERBS[verb](*_subject(verb, entry[verb]), **{name: getattr(read, name) for name in given})
+    values = _values(_VERBS[verb])
+    given = {name: entry[name] for name in entry if name not in (verb, "since")}  # older files hold `since`, unused
+    if unknown := sorted(str(name) for name in given.keys() - values.keys()):
+        raise HemislamError(f"{verb} has no {unknown[0]}; it takes {' and '.join(values) or 'nothing else'}.")
+    for name, value in (values | given).items():
+        kind, must_be = _VALUES[name]
+        try:
+            values[name] = kind.validate_python(value)
+        except ValidationError:
+            raise HemislamError(f"{name} is {value!r}; it must be {must_be}.") from None
+    edit: LoopEdit = _VERBS[verb](*_subject(verb, entry[verb]), **values)
     check(edit)
     return edit
 
 
-def _names(kind: type[LoopEdit]) -> list[str]:
-    """What an entry may hold beside its verb."""
-    return [field.name for field in fields(kind) if field.name not in ("older", "newer", "what")]
+def _values(kind: type[LoopEdit]) -> dict[str, Any]:
+    """What an entry may hold beside its verb, with the defaults; None: it must be given."""
+    names = (field for field in fields(kind) if field.name not in ("older", "newer", "what"))
+    return {field.name: None if field.default is MISSING else field.default for field in names}
 
 
 def _subject(verb: str, value: object) -> tuple[Any, ...]:
     """What an edit is for, as its first arguments."""
     if verb == "solve":
+        if value != _AT_ONCE:
+            raise HemislamError(f"solve is {value!r}; it can only be `{_AT_ONCE}`.")
         return ()
-    if verb != "override":
-        return _pair(verb, value)
-    if not isinstance(value, str) or not re.fullmatch(r"(fix \d{1,9}|point .{1,100})", value):
-        raise HemislamError(f"override is {value!r}; it takes `fix 12` or `point NAME`.")
-    return (value,)
-
-
-def _pair(verb: str, value: object) -> Pair:
+    if verb == "override":
+        if not isinstance(value, str) or not re.fullmatch(r"(fix \d{1,9}|point .{1,100})", value):
+            raise HemislamError(f"override is {value!r}; it takes `fix 12` or `point NAME`.")
+        return (value,)
     names = [re.fullmatch(r"(?:(\d{1,6})/)?(\d{1,12})", str(one)) for one in value] if isinstance(value, list) else []
-    pair = [KeyframeId(int(name[1] or 0), int(name[2])) for name in names if name]
+    pair = tuple(KeyframeId(int(name[1] or 0), int(name[2])) for name in names if name)
     if len(names) != 2 or len(pair) != 2 or pair[0] >= pair[1]:
         raise HemislamError(f"{verb} is {value!r}; it takes two keyframes, the older one first: [12, 340].")
-    return pair[0], pair[1]
+    return pair
