@@ -114,7 +114,7 @@ class LoopBackend:
         """The answer to a question; a `Failure` if it cannot be done."""
         question = ask.question
         try:
-            self._stand(ask.target)
+            self._go_to_target(ask.target)
             match question:
                 case TryOut(edit):
                     return Answered(question, self.preview(edit))
@@ -138,7 +138,7 @@ class LoopBackend:
             notices=self.take_notices(),
         )
 
-    def _stand(self, target: Target) -> None:
+    def _go_to_target(self, target: Target) -> None:
         """Go to a state. Raises as `load`, and then nothing has changed."""
         self.load(target.edits)
         count = min(target.count, self.known)

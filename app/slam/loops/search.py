@@ -17,7 +17,7 @@ from app.slam.loops.drift import Drift, Expectation, expect
 from app.slam.loops.edits import apply_edits
 from app.slam.loops.factors import PositionPrior, loosened, odometry_factor
 from app.slam.loops.pose_graph import Graph, Measured
-from app.slam.loops.support import placed, settle
+from app.slam.loops.support import settle, sparsified
 from app.slam.loops.types import LoopEdge, Pair, Verdict
 from app.slam.loops.verdicts import judge
 from app.slam.sections import LoopsParams
@@ -163,7 +163,9 @@ class Search:
             known, settled = known | fresh, list(fresh.values())
             if any(edge.verdict is Verdict.CANDIDATE for edge in settled):
                 settled = settle(fresh, known, detector.poses, detector.pauses_before, drift, params, now)
-                settled = placed(settled, known.values(), detector.poses, poses, detector.pauses_before, detector.half)
+                settled = sparsified(
+                    settled, known.values(), detector.poses, poses, detector.pauses_before, detector.half
+                )
             updates.update((edge.pair, edge) for edge in settled)
             known.update(updates)
         return tuple(updates.values())

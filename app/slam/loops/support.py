@@ -126,7 +126,7 @@ def _ends(edges: Iterable[LoopEdge], walked: F64) -> F64:
     return np.asarray(walked[np.array([edge.pair for edge in edges], np.int64).reshape(-1, 2)])
 
 
-def placed(
+def sparsified(
     settled: Iterable[LoopEdge],
     edges: Iterable[LoopEdge],
     T_odom_imu: F64,
@@ -149,20 +149,20 @@ def placed(
     counting = {edge.pair: edge for edge in edges if edge.counts}
     out = []
     for edge in settled:
-        if edge.verdict is Verdict.ACCEPTED and edge.represented_by is None and edge.pair not in counting:
+        if edge.counts and edge.pair not in counting:
             alike = [
                 other
                 for other in counting.values()
                 if (pauses_before[[*other.pair]] == pauses_before[[*edge.pair]]).all()
             ]
-            edge = _placed(edge, alike, T_odom_imu, T_map_imu, half)
+            edge = _sparsified(edge, alike, T_odom_imu, T_map_imu, half)
             if edge.counts:
                 counting[edge.pair] = edge
         out.append(edge)
     return out
 
 
-def _placed(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_map_imu: F64, half: int) -> LoopEdge:
+def _sparsified(edge: LoopEdge, counting: Collection[LoopEdge], T_odom_imu: F64, T_map_imu: F64, half: int) -> LoopEdge:
     counting = [other for other in counting if edge.open or not other.open]
     near = next((other for other in counting if _apart(edge, other) <= half // 2), None)
     if near is not None:

@@ -12,7 +12,7 @@ from app.slam.loops.drift import Drift
 from app.slam.loops.edits import Add, Reject, SetWeight, apply_edits
 from app.slam.loops.factors import Factor, loop_factors
 from app.slam.loops.solvers import optimise
-from app.slam.loops.support import placed, settle, transported
+from app.slam.loops.support import settle, sparsified, transported
 from app.slam.loops.types import Evidence, LoopEdge, Origin, Verdict
 from app.slam.loops.verdicts import FLOOR_M, FLOOR_YAW
 from app.slam.sections import LoopsParams
@@ -48,7 +48,9 @@ def come(loops: list[LoopEdge], poses: F64 = POSES, in_map: F64 | None = None) -
     """One after the other, by their older ends."""
     edges: dict[int, LoopEdge] = {}
     for edge in loops:
-        (edges[edge.older],) = placed([edge], edges.values(), poses, poses if in_map is None else in_map, PIECES, HALF)
+        (edges[edge.older],) = sparsified(
+            [edge], edges.values(), poses, poses if in_map is None else in_map, PIECES, HALF
+        )
     return edges
 
 
@@ -91,7 +93,7 @@ def test_to_another_time_at_a_place_a_loop_counts_if_it_is_news_or_the_last_is_l
     T = lie.inverse(third[older]) @ third[newer]
     T[1, 3] += off_m
     second = replace(first, older=older, newer=newer, T_older_newer=T)
-    (edge,) = placed([second], [first], third, third, PIECES, HALF)
+    (edge,) = sparsified([second], [first], third, third, PIECES, HALF)
     assert edge.counts is not told and edge.represented_by == (first.pair if told else None)
 
 
@@ -184,7 +186,7 @@ def test_no_loop_is_laid_on_one_that_the_user_made() -> None:
     made = replace(loop(40), origin=Origin.USER, edited=True)
     elsewhere = POSES.copy()
     elsewhere[TURN:, 1, 3] = 0.5
-    (edge,) = placed([loop(34)], [made], POSES, elsewhere, PIECES, HALF)
+    (edge,) = sparsified([loop(34)], [made], POSES, elsewhere, PIECES, HALF)
     assert edge.counts and edge.repeats is None
 
 
@@ -316,5 +318,7 @@ def test_along_a_direction_that_both_leave_open_loops_need_not_agree() -> None:
 def test_a_loop_that_leaves_a_direction_open_stands_for_none_that_does_not() -> None:
     along = np.diag([FLOOR_YAW**2] * 3 + [100.0, FLOOR_M**2, FLOOR_M**2])
     opened = replace(loop(40), covariance=along)
-    assert [edge.represented_by for edge in placed([loop(39)], [opened], POSES, POSES, PIECES, HALF)] == [None]
-    assert [edge.represented_by for edge in placed([opened], [loop(39)], POSES, POSES, PIECES, HALF)] == [loop(39).pair]
+    assert [edge.represented_by for edge in sparsified([loop(39)], [opened], POSES, POSES, PIECES, HALF)] == [None]
+    assert [edge.represented_by for edge in sparsified([opened], [loop(39)], POSES, POSES, PIECES, HALF)] == [
+        loop(39).pair
+    ]
