@@ -32,14 +32,12 @@ class Search:
 
     Attributes:
         start: parameters that act on restart. detector: holds the keyframes.
-        found: candidates with the first `len` keyframes, with their verdicts.
         finished: whether the session ends there. graph: without any edits.
     """
 
     def __init__(self) -> None:
         self.start = LoopsParams()
         self.detector = Detector(self.start)
-        self.found: dict[Pair, LoopEdge] = {}
         self.finished = False
         self._params: list[LoopsParams] = []  # for each keyframe
         self._measured: list[Measured] = []
@@ -55,6 +53,12 @@ class Search:
     def known(self) -> int:
         """Keyframes of the history, including those beyond the present one."""
         return len(self._found)
+
+    @property
+    def found(self) -> dict[Pair, LoopEdge]:
+        """The candidates with the first `len` keyframes, with their verdicts."""
+        last = self._ends[len(self)] if self.finished else ()
+        return {edge.pair: edge for found in (*self._found[: len(self)], last) for edge in found}
 
     @property
     def measured(self) -> Sequence[Measured]:
@@ -103,13 +107,10 @@ class Search:
 
     def finish(self) -> None:
         """The session ends here: look for loops of the last keyframes too. `add` and `go_to` take that back."""
-        if self.finished or not len(self):
-            return
         count = len(self)
-        if count not in self._ends:
+        if count and count not in self._ends:
             self._ends[count] = self._look(range(max(count - self.detector.ahead, 0), count))
-        self.finished = True
-        self.found |= {edge.pair: edge for edge in self._ends[count]}
+        self.finished = count > 0
 
     def go_to(self, count: int) -> None:
         """Go to the state after `count` keyframes of the history. Raises HemislamError if it has fewer."""
@@ -117,7 +118,6 @@ class Search:
             raise HemislamError(f"The loop search knows {self.known} keyframes and cannot go to {count}.")
         self.finished = False
         self.detector.go_to(count)
-        self.found = {edge.pair: edge for found in self._found[:count] for edge in found}
 
     def forget(self) -> None:
         """Forget the history beyond the present keyframe."""
