@@ -145,8 +145,8 @@ class Detector:
 
     def submap(self, index: int, *, wide: bool = False) -> Prepared:
         """The submap from the keyframes around this one, up to the nearest slip of odometry on either side."""
-        before = range(index, self._first(index, self.half), -1)
-        after = range(index + 1, self.last(index, self.half) + 1)
+        first, last = self._span(index, self.half, self.half)
+        before, after = range(index, first, -1), range(index + 1, last + 1)
         first = next((k for k in before if self.slip(k) is not None), before.stop)
         end = next((k for k in after if self.slip(k) is not None), after.stop) - 1
         return self._prepared(index, first, end, wide)
@@ -158,7 +158,7 @@ class Detector:
         """
         if self._resumed[index]:
             return None
-        first, last = self._first(index, slips.REACH), self.last(index, slips.REACH - 1)
+        first, last = self._span(index, slips.REACH, slips.REACH - 1)
         if (index, last) not in self._slips:
             before, after = self._prepared(first, first, index - 1), self._prepared(index, index, last)
             self._slips[index, last] = slips.slip(before, after, self.guess(first, index, self._poses))
@@ -187,8 +187,15 @@ class Detector:
 
     def guess(self, older: int, newer: int, poses: F64) -> F64:
         """(4, 4) T_older_newer of the level frames, by poses T_map_imu of all keyframes."""
-        T_older_newer = lie.inverse(poses[older]) @ poses[newer]
+        return self.level(older, newer, lie.inverse(poses[older]) @ poses[newer])
+
+    def level(self, older: int, newer: int, T_older_newer: F64) -> F64:
+        """(4, 4) T_older_newer of the level frames from that of the IMU frames."""
         return np.asarray(self.T_level_imu(older) @ T_older_newer @ lie.inverse(self.T_level_imu(newer)))
+
+    def from_level(self, older: int, newer: int, T_level: F64) -> F64:
+        """The inverse of `level`."""
+        return np.asarray(lie.inverse(self.T_level_imu(older)) @ T_level @ self.T_level_imu(newer))
 
     def both(self, older: int, newer: int) -> tuple[Prepared, Prepared]:
         """The submaps of both. They reach farther if one place is bare. The newer is made first: it is needed again."""
@@ -207,7 +214,7 @@ class Detector:
         """
         guess = T = self.guess(older, newer, poses)
         if T_older_newer is not None:
-            T = self.T_level_imu(older) @ T_older_newer @ lie.inverse(self.T_level_imu(newer))
+            T = self.level(older, newer, T_older_newer)
         a, b = self.context(older), self.context(newer)
         return LoopDetail(
             older=self.submap(older).submap.points,
@@ -243,15 +250,11 @@ class Detector:
         distance = float(np.where(allowed, distances, np.inf).min())
         return Sighting(KeyframeId(0, older), KeyframeId(0, newer), distance)
 
-    def last(self, index: int, ahead: int) -> int:
-        """The last keyframe, at most `ahead` after this one, before any pause."""
+    def _span(self, index: int, back: int, ahead: int) -> tuple[int, int]:
+        """The first and the last keyframe, at most `back` before and `ahead` after this one, with no pause between."""
         end = min(len(self), index + ahead + 1)
         paused = np.flatnonzero(self._resumed[index + 1 : end])
-        return index + int(paused[0]) if len(paused) else end - 1
-
-    def _first(self, index: int, back: int) -> int:
-        """The first keyframe, at most `back` before this one, after any pause."""
-        return max(self._begin(index), index - back)
+        return max(self._begin(index), index - back), index + int(paused[0]) if len(paused) else end - 1
 
     def _begin(self, index: int) -> int:
         """The first keyframe after the last pause before this one; without a pause, the first of all."""
@@ -259,8 +262,7 @@ class Detector:
         return int(paused[-1]) if len(paused) else 0
 
     def _describe(self, index: int) -> ScanContext:
-        first, last = self._first(index, self.half), self.last(index, self.half)
-        return scan_context.describe(self._around(index, first, last).points)
+        return scan_context.describe(self._around(index, *self._span(index, self.half, self.half)).points)
 
 
 def _wrapped(angle: npt.NDArray[np.float64]) -> F64:

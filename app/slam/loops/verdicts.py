@@ -53,7 +53,7 @@ def judge(
         reason = (
             f"the places look different: context distance {sighting.distance:.2f} (most {params.context_distance:g})"
         )
-        return edge(_imu(detector, older, newer, guess), np.eye(6), evidence, reason)
+        return edge(detector.from_level(older, newer, guess), np.eye(6), evidence, reason)
 
     found = _place(older, newer, detector, expectation, params, height_known=not broken)
     fit = found.fit
@@ -66,7 +66,7 @@ def judge(
         alternative_m=found.alternative_m,
         mahalanobis=found.deviation.sigmas,
     )
-    T = _imu(detector, older, newer, fit.T_target_source)
+    T = detector.from_level(older, newer, fit.T_target_source)
     paused = detector.pauses_before[older] < detector.pauses_before[newer]
     reason = _objection(found, evidence, params, FAR_M if paused else NEAR_M) or (
         "" if broken else _far_off(found.deviation, evidence, params)
@@ -87,7 +87,7 @@ def _place(
     """The alignment of the newer place with the older one, searched as far as odometry may be off."""
 
     def deviation(T_level: F64) -> Deviation:
-        return expectation.deviation(older, _imu(detector, older, newer, T_level))
+        return expectation.deviation(older, detector.from_level(older, newer, T_level))
 
     sigma = float(expectation.position_sigmas()[older])
     reach = WIDER * params.max_mahalanobis
@@ -103,7 +103,7 @@ def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
     poses = detector.poses
     T_older_newer = np.array(edit.guess) if edit.guess else lie.inverse(poses[older]) @ poses[newer]
     both = detector.both(older, newer)
-    guess = detector.T_level_imu(older) @ T_older_newer @ lie.inverse(detector.T_level_imu(newer))
+    guess = detector.level(older, newer, T_older_newer)
     if not edit.register:
         fit = assess(*both, guess)
     elif edit.guess:
@@ -113,7 +113,7 @@ def by_hand(edit: Add, detector: Detector, params: LoopsParams) -> LoopEdge:
         fit = _place(older, newer, detector, expectation, params).fit
     evidence = Evidence(overlap=fit.overlap, residual_rms=fit.residual_rms, condition=fit.condition)
     reason = f"added manually: overlap {100 * fit.overlap:.0f} %, residual {fit.residual_rms * 1e3:.0f} mm"
-    T = _imu(detector, older, newer, fit.T_target_source) if edit.register else T_older_newer
+    T = detector.from_level(older, newer, fit.T_target_source) if edit.register else T_older_newer
     sigma = covariance(detector, newer, fit)
     return LoopEdge(older, newer, newer, T, sigma, evidence, Verdict.ACCEPTED, reason, Origin.USER, edited=True)
 
@@ -190,8 +190,3 @@ def _far_off(deviation: Deviation, e: Evidence, p: LoopsParams) -> str:
     if e.mahalanobis > WIDER * p.max_mahalanobis:
         return e.against_odometry(WIDER * p.max_mahalanobis)
     return ""
-
-
-def _imu(detector: Detector, older: int, newer: int, T_level: F64) -> F64:
-    """T_older_newer of the IMU frames from that of the level frames."""
-    return np.asarray(lie.inverse(detector.T_level_imu(older)) @ T_level @ detector.T_level_imu(newer))
