@@ -1,7 +1,8 @@
 """NMEA 0183 sentences of a receiver: GGA for places, GST for their sigmas, RMC and ZDA for the day."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
@@ -11,7 +12,7 @@ import numpy as np
 from app.georeference.fixes import Fixes
 from app.slam.errors import HemislamError
 
-_DAY_S = 86_400.0
+_DAY_NS = 86_400_000_000_000
 _YEARS = range(1980, 2200)
 """Valid years: since GPS time began, and as far as stamps in ns reach."""
 _PAUSE_NS = 60_000_000_000
@@ -19,123 +20,101 @@ _PAUSE_NS = 60_000_000_000
 _NOBODY = (float("nan"),) * 3
 
 
-@dataclass(slots=True)
-class _Log:
-    """The content of a receiver's sentences, in their order.
+@dataclass(frozen=True, slots=True)
+class _Sentence:
+    """The content of a sentence: a place, sigmas, or the day.
 
     Attributes:
-        walk_ns: the time of the walk: of two dates that contradict each other without a pause, the nearer one counts.
-        near_ns: a time within half a day, for sentences without a date; at first the time of the walk.
-        places: latitude and longitude in degrees, height above the geoid, and the geoid's height above the ellipsoid
-            (nan if not stated), m. stamps: of each place, in ns.
-        sigmas: of each place, m to the east, north and up. told: those of the day's GST, by s of the day.
-        untold: by s of the day, the places without sigmas so far. now: s of the day; if it steps back, a day begins.
-        fixed: whether the last GGA or RMC has a fix; None before the first. Without a fix, the date of ZDA may be that
-            of the receiver's own clock.
-        early: day, and s of the day, by the last ZDA before the first GGA or RMC, which decides whether it counts.
-        begin: the first place after the last pause. dated: whether a sentence has stated its day.
+        at_ns: time of the day.
+        place: latitude and longitude in degrees, height above the geoid, and the geoid's height above the ellipsoid
+            (nan if not stated), m.
+        sigmas: of the place at the same time, m to the east, north and up. day_ns: the begin of the day.
     """
 
-    walk_ns: int
-    near_ns: int
-    places: list[tuple[float, float, float, float]] = field(default_factory=list)
-    stamps: list[int] = field(default_factory=list)
-    sigmas: list[tuple[float, float, float]] = field(default_factory=list)
-    told: dict[float, tuple[float, float, float]] = field(default_factory=dict)
-    untold: dict[float, int] = field(default_factory=dict)
-    now: float = 0.0
-    fixed: bool | None = None
-    early: tuple[datetime, float] | None = None
-    begin: int = 0
-    dated: bool = False
-
-    def add(self, line: str) -> None:
-        """Add one line; anything but a complete sentence with the right checksum is ignored."""
-        body, star, checksum = line.strip().rpartition("$")[2].partition("*")
-        if not star or checksum[:2].upper() != f"{reduce(xor, body.encode(), 0):02X}":
-            return
-        kind, *words = body.split(",")
-        try:
-            if kind.endswith("GGA") and len(words) > 10:
-                self._set_fixed(int(words[5] or 0) > 0)
-                if self.fixed:
-                    self._place(words)
-            elif kind.endswith("GST") and len(words) > 7 and words[5]:
-                north, east, up = (float(word) for word in words[5:8])
-                at = self._at(words[0])
-                self.told[at] = east, north, up
-                if at in self.untold:
-                    self.sigmas[self.untold.pop(at)] = self.told[at]
-            elif kind.endswith("RMC") and len(words) > 8:
-                self._set_fixed(words[1] == "A")
-                if self.fixed and words[8]:
-                    self._day(datetime.strptime(words[8], "%d%m%y"), _seconds(words[0]))
-            elif kind.endswith("ZDA") and len(words) > 3 and words[3]:
-                day = datetime.strptime("".join(words[1:4]), "%d%m%Y"), _seconds(words[0])
-                if self.fixed:
-                    self._day(*day)
-                elif self.fixed is None:
-                    self.early = day
-        except (ValueError, OverflowError, KeyError):
-            return
-
-    def _set_fixed(self, fixed: bool) -> None:
-        if fixed and self.fixed is None and self.early:
-            self._day(*self.early)
-        self.fixed = fixed
-
-    def _place(self, words: list[str]) -> None:
-        latitude, longitude = _degrees(words[1], words[2]), _degrees(words[3], words[4])
-        at = self._at(words[0])
-        self.near_ns = self._guessed(at)
-        self.places.append((latitude, longitude, float(words[8]), float(words[10] or "nan")))
-        self.stamps.append(self.near_ns)
-        self.sigmas.append(self.told.get(at, _NOBODY))
-        if self.sigmas[-1] is _NOBODY:
-            self.untold[at] = len(self.sigmas) - 1
-
-    def _at(self, text: str) -> float:
-        """s of the day, of a place or its sigmas."""
-        before, self.now = self.now, _seconds(text)
-        if self.now < before - _PAUSE_NS / 1e9:
-            self.told.clear()
-            self.untold.clear()
-        return self.now
-
-    def _day(self, day: datetime, at_s: float) -> None:
-        if day.year not in _YEARS:
-            return
-        stamp_ns = round(day.replace(tzinfo=UTC).timestamp()) * 1_000_000_000 + round(at_s * 1e9)
-        guessed_ns = self._guessed(at_s)
-        if self.dated and abs(stamp_ns - self.walk_ns) >= abs(guessed_ns - self.walk_ns):
-            return
-        off = stamp_ns - guessed_ns
-        self.stamps[self.begin :] = [stamp + off for stamp in self.stamps[self.begin :]]
-        self.near_ns, self.dated = stamp_ns, True
-
-    def _guessed(self, at_s: float) -> int:
-        """The stamp of a time of the day, on the day of the sentences so far unless there was a pause."""
-        stamp_ns = _nearest(at_s, self.near_ns)
-        if abs(stamp_ns - self.near_ns) > _PAUSE_NS:
-            self.begin, self.dated = len(self.stamps), False
-        return stamp_ns
+    at_ns: int
+    place: tuple[float, float, float, float] | None = None
+    sigmas: tuple[float, float, float] | None = None
+    day_ns: int | None = None
 
 
 def read(lines: Iterable[str], source: str, near_ns: int) -> tuple[Fixes, bool]:
     """The fixes of a log, and whether their heights are above the ellipsoid rather than the geoid.
 
+    Args:
+        near_ns: a time of the walk, which gives the day of sentences without a date.
+
     Raises:
         HemislamError: naming `source`: there is no GGA sentence with a place.
     """
-    log = _Log(near_ns, near_ns)
-    for line in lines:
-        log.add(line)
-    if not log.places:
+    sentences = _parsed(lines)
+    stamped = list(zip(_stamps(sentences, near_ns), sentences, strict=True))
+    sigmas = {stamp: one.sigmas for stamp, one in stamped if one.sigmas}
+    fixes = [(*one.place, *sigmas.get(stamp, _NOBODY)) for stamp, one in stamped if one.place]
+    if not fixes:
         raise HemislamError(f"{source} holds no NMEA sentence GGA with a position; switch it on in the receiver.")
-    *place, height, separation = np.array(log.places).T
+    table = np.array(fixes)
+    place, height, separation = table[:, :2], table[:, 2], table[:, 3]
     ellipsoidal = bool(np.isfinite(separation).all())  # if it is missing once, all heights stay above the geoid
-    places = np.column_stack([*place, height + separation if ellipsoidal else height])
-    return Fixes.of(log.stamps, places, log.sigmas), ellipsoidal
+    places = np.column_stack([place, height + separation if ellipsoidal else height])
+    return Fixes.of([stamp for stamp, one in stamped if one.place], places, table[:, 4:]), ellipsoidal
+
+
+def _parsed(lines: Iterable[str]) -> list[_Sentence]:
+    """The sentences that count, in their order.
+
+    Places without a fix are left out, and so are dates, which may be those of the receiver's own clock. A date before
+    the first GGA or RMC counts if that has a fix.
+    """
+    sentences = list[_Sentence]()
+    fixed: bool | None = None  # whether the last GGA or RMC has a fix
+    for kind, *words in _sound(lines):
+        before = fixed
+        with contextlib.suppress(ValueError, OverflowError, KeyError):  # what makes no sense is ignored
+            match kind[-3:], words:
+                case "GGA", [at, latitude, north, longitude, east, quality, _, _, height, _, separation, *_]:
+                    if fixed := int(quality or 0) > 0:
+                        place = _degrees(latitude, north), _degrees(longitude, east)
+                        heights = float(height), float(separation or "nan")
+                        sentences.append(_Sentence(_time_ns(at), place=(*place, *heights)))
+                case "GST", [at, _, _, _, _, north, east, up, *_] if north:
+                    sentences.append(_Sentence(_time_ns(at), sigmas=(float(east), float(north), float(up))))
+                case "RMC", [at, status, _, _, _, _, _, _, date, *_]:
+                    if (fixed := status == "A") and date:
+                        sentences.append(_Sentence(_time_ns(at), day_ns=_day_ns(date, "%d%m%y")))
+                case "ZDA", [at, day, month, year, *_] if year and fixed is not False:
+                    sentences.append(_Sentence(_time_ns(at), day_ns=_day_ns(day + month + year, "%d%m%Y")))
+        if before is None and fixed is False:
+            sentences = [one for one in sentences if one.day_ns is None]
+    return sentences
+
+
+def _sound(lines: Iterable[str]) -> Iterator[list[str]]:
+    """The words of each complete sentence with the right checksum. Loggers may put a time before a sentence."""
+    for line in lines:
+        body, star, checksum = line.strip().rpartition("$")[2].partition("*")
+        if star and checksum[:2].upper() == f"{reduce(xor, body.encode(), 0):02X}":
+            yield body.split(",")
+
+
+def _stamps(sentences: Sequence[_Sentence], walk_ns: int) -> list[int]:
+    """When each sentence was sent.
+
+    Between pauses, one date gives the day of all sentences; of dates that contradict each other, the one nearer to the
+    walk. Without a date, the day is the nearest to the time before the pause, at first to the walk.
+    """
+    stamps, last_ns, begin, dated = list[int](), walk_ns, 0, False
+    for number, one in enumerate(sentences):
+        stamp = one.at_ns + round((last_ns - one.at_ns) / _DAY_NS) * _DAY_NS
+        if abs(stamp - last_ns) > _PAUSE_NS:
+            begin, dated = number, False
+        if one.day_ns is not None:
+            stated = one.day_ns + one.at_ns
+            if not dated or abs(stated - walk_ns) < abs(stamp - walk_ns):
+                stamps[begin:] = [earlier + stated - stamp for earlier in stamps[begin:]]
+                stamp, dated = stated, True
+        stamps.append(stamp)
+        last_ns = stamp
+    return stamps
 
 
 def _degrees(text: str, side: str) -> float:
@@ -144,13 +123,14 @@ def _degrees(text: str, side: str) -> float:
     return (whole + minutes / 60.0) * {"N": 1.0, "E": 1.0, "S": -1.0, "W": -1.0}[side]
 
 
-def _seconds(text: str) -> float:
-    """hhmmss.ss as seconds of the day."""
-    return int(text[:2]) * 3600.0 + int(text[2:4]) * 60.0 + float(text[4:])
+def _time_ns(text: str) -> int:
+    """hhmmss.ss as time of the day."""
+    return round((int(text[:2]) * 3600.0 + int(text[2:4]) * 60.0 + float(text[4:])) * 1e9)
 
 
-def _nearest(at_s: float, near_ns: int) -> int:
-    """The stamp with this time of the day that is nearest to another one."""
-    day = round(_DAY_S * 1e9)
-    at = round(at_s * 1e9)
-    return at + round((near_ns - at) / day) * day
+def _day_ns(text: str, form: str) -> int:
+    """The begin of a day. Raises ValueError: there is none, or it cannot be one of a log."""
+    day = datetime.strptime(text, form).replace(tzinfo=UTC)
+    if day.year not in _YEARS:
+        raise ValueError
+    return round(day.timestamp()) * 1_000_000_000
