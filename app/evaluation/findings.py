@@ -1,7 +1,8 @@
 """Findings of a report in sentences: where the tables confirm the paper, and where they contradict it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -43,20 +44,15 @@ class Claim:
 def findings(recordings: Sequence[Evaluated]) -> list[str]:
     """One sentence each, the largest difference first; the user's variants are among the first `MOST_TOLD`."""
     found = _own(recordings) + _mishaps(recordings)
-    for name, base, what in _CLAIMS:
-        for metric in _METRICS:
-            chosen = [recording for recording in recordings if recording.name.startswith(metric.where)]
-            difference = _difference(chosen, name, base, metric)
-            if difference is not None:
-                text = f"{name} against {base} ({what}): the mean {metric.name} {difference.words}{difference.rest}"
-                surprising = difference.against and metric.promised
-                text += "; this goes against what the paper found." if surprising else "."
-                found.append(Claim(text, difference.size))
-    found.sort(key=lambda finding: -finding.size)
-    own = [finding for finding in found if finding.own][:MOST_TOLD]
-    others = [finding for finding in found if finding not in own]
-    first = sorted(own + others[: MOST_TOLD - len(own)], key=lambda finding: -finding.size)
-    return [finding.text for finding in first + [finding for finding in found if finding not in first]]
+    for (name, base, what), metric in product(_CLAIMS, _METRICS):
+        if (difference := _difference(recordings, name, base, metric)) is not None:
+            text = f"{name} against {base} ({what}): the mean {metric.name} {difference.words}{difference.rest}"
+            surprising = difference.against and not metric.is_time
+            text += "; this goes against what the paper found." if surprising else "."
+            found.append(Claim(text, difference.size))
+    found.sort(key=lambda claim: -claim.size)
+    first = sorted(found, key=lambda claim: not claim.own)[:MOST_TOLD]
+    return [claim.text for claim in sorted(found, key=lambda claim: claim not in first)]
 
 
 def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
@@ -111,36 +107,34 @@ def _mishaps(recordings: Sequence[Evaluated]) -> list[Claim]:
 class _Metric:
     """Attributes:
     path: of its value, as for `Outcome.value`. where: prefix of the names of the recordings concerned.
-    promised: whether the paper found that the value falls. like: relative difference below which values count as equal.
     """
 
     name: str
     path: str
-    unit: str
-    digits: str
+    unit: str = "m"
     where: str = ""
-    promised: bool = True
-    like: float = LIKE
+
+    @property
+    def is_time(self) -> bool:
+        """Times differ more from run to run, and the paper does not promise that they fall."""
+        return self.unit == "ms"
+
+    def text(self, value: float) -> str:
+        return f"{value:.2f}" if self.is_time else f"{value:.3g}"
 
 
-_ATE = "accuracy/ate_m/rmse"
-_CPU = "runtime_ms/cpu/mean"
+_ATE = _Metric("error (ATE)", "accuracy/ate_m/rmse")
+_CPU = _Metric("CPU time per frame", "runtime_ms/cpu/mean", "ms")
 """CPU time: the time least disturbed by other programs on the machine."""
 _METRICS = (
-    _Metric("error (ATE)", _ATE, "m", ".3g"),
-    _Metric("error (ATE) outdoors", _ATE, "m", ".3g", where="outdoor"),
-    _Metric(f"error (ATE) without the first {START_S:g} s", "accuracy/ate_after_start_m", "m", ".3g"),
-    _Metric("CPU time per frame", _CPU, "ms", ".2f", promised=False, like=LIKE_IN_TIME),
+    _ATE,
+    replace(_ATE, name="error (ATE) outdoors", where="outdoor"),
+    _Metric(f"error (ATE) without the first {START_S:g} s", "accuracy/ate_after_start_m"),
+    _CPU,
     # Table 3: outdoors, where much of a scan is ground, thinning the ground should recover most of its cost
-    _Metric("CPU time per frame outdoors", _CPU, "ms", ".2f", where="outdoor", promised=False, like=LIKE_IN_TIME),
+    replace(_CPU, name="CPU time per frame outdoors", where="outdoor"),
 )
-
-
-_OWN_METRICS = (
-    _Metric("error (ATE)", _ATE, "m", ".3g"),
-    _Metric("CPU time per frame", _CPU, "ms", ".2f", like=LIKE_IN_TIME),
-    _Metric("plane thickness", "map_sharpness/thickness", "m", ".3g"),
-)
+_OWN_METRICS = (_ATE, _CPU, _Metric("plane thickness", "map_sharpness/thickness"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,20 +151,16 @@ class _Difference:
 
 def _difference(recordings: Sequence[Evaluated], name: str, base: str, metric: _Metric) -> _Difference | None:
     """`name` compared with `base` over all recordings that have both; None if there is no such recording."""
-    pairs = []
-    for recording in recordings:
-        outcomes = {outcome.name: outcome for outcome in recording.outcomes}
-        if name in outcomes and base in outcomes:
-            ours, theirs = (outcomes[system].value(metric.path) for system in (name, base))
-            if ours is not None and theirs is not None:
-                pairs.append((recording.name, ours, theirs))
+    both = [(r.name, *r.values((name, base), metric.path)) for r in recordings if r.name.startswith(metric.where)]
+    pairs = [(where, ours, theirs) for where, ours, theirs in both if ours is not None and theirs is not None]
     if not pairs:
         return None
     ours, theirs = (float(np.mean([pair[k] for pair in pairs])) for k in (1, 2))
-    verdict, against = _compare(ours, theirs, metric.like)
-    words = f"{verdict}, {theirs:{metric.digits}} to {ours:{metric.digits}} {metric.unit}"
+    like = LIKE_IN_TIME if metric.is_time else LIKE
+    verdict, against = _compare(ours, theirs, like)
+    words = f"{verdict}, {metric.text(theirs)} to {metric.text(ours)} {metric.unit}"
     (certainty, may_be_chance), rest = _certainty(pairs), ""
-    worse = [pair[0] for pair in pairs if _compare(pair[1], pair[2], metric.like)[1]]
+    worse = [pair[0] for pair in pairs if _compare(pair[1], pair[2], like)[1]]
     if len(pairs) > 1:
         words += f" over {len(pairs)} recordings{certainty}"
         where = ", ".join(worse) if len(worse) <= MOST_NAMED else f"{len(worse)} of them"
@@ -190,8 +180,7 @@ def _certainty(pairs: Sequence[tuple[str, float, float]]) -> tuple[str, bool]:
     may_be_chance = LIKE * base < mean < CHANCE * error
     if base == 0:
         return " (may be chance)" if may_be_chance else "", may_be_chance
-    words = f" (± {100 * error / base:.1f} %, one standard error{': may be chance' if may_be_chance else ''})"
-    return words, may_be_chance
+    return f" (± {100 * error / base:.1f} %, one standard error{': may be chance' * may_be_chance})", may_be_chance
 
 
 def _compare(ours: float, theirs: float, like: float) -> tuple[str, bool]:

@@ -1,5 +1,6 @@
 """Reads the files of a finished run and measures them against the truth."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -136,6 +137,11 @@ class Evaluated:
     truth: str = ""
     notes: tuple[str, ...] = ()
     truth_path: F64 | None = None
+
+    def values(self, names: Sequence[str], path: str) -> list[Any]:
+        """`Outcome.value` of the outcomes with these names; None where there is none."""
+        outcomes = {outcome.name: outcome for outcome in self.outcomes}
+        return [outcomes[name].value(path) if name in outcomes else None for name in names]
 
 
 def load(job: Job, meaning: str) -> Outcome:

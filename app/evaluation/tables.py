@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from typing import Any
 
 import numpy as np
 
@@ -97,11 +96,11 @@ def all_errors(recordings: Sequence[Evaluated]) -> Table:
     units = (("m", "position", "m", ".4f", ""), ("deg", "rotation", "°", ".3f", " (°/m)"))
     rows: list[TableRow] = []
     for recording in recordings:
-        lengths = _values(recording, names, "accuracy/distance_m")
+        lengths = recording.values(names, "accuracy/distance_m")
         if not any(lengths):
             continue
         for (of, path), (unit, what, shown, form, per_metre) in product(paths.items(), units):
-            spreads = _values(recording, names, path + unit)
+            spreads = recording.values(names, path + unit)
             ratios = [
                 {kind: spread[kind] / length for kind in _SPREAD} if spread and length else None
                 for spread, length in zip(spreads, lengths, strict=True)
@@ -221,17 +220,11 @@ def _names(recordings: Iterable[Evaluated], *, run: bool = False) -> tuple[str, 
     return tuple(dict.fromkeys(o.name for o in outcomes if not run or o.run is not None or o.missing))
 
 
-def _values(recording: Evaluated, names: Sequence[str], path: str) -> list[Any]:
-    """The value of each named outcome; None where there is none."""
-    outcomes = {outcome.name: outcome for outcome in recording.outcomes}
-    return [outcomes[name].value(path) if name in outcomes else None for name in names]
-
-
 def _rows(recordings: Iterable[Evaluated], names: Sequence[str], indicators: Sequence[Indicator]) -> list[TableRow]:
     """A row for each recording and indicator that has a value."""
     rows = []
     for recording, indicator in product(recordings, indicators):
-        found = _values(recording, names, indicator.path)
+        found = recording.values(names, indicator.path)
         values = [None if value is None else indicator.scale * value for value in found]
         if any(value is not None for value in values):
             rows.append(_row(recording.name, indicator, values))
