@@ -92,7 +92,7 @@ def tune(
     from app.tuning.report import BEST
     from app.tuning.space import parse_dimensions
     from app.tuning.trial import Trial, advice, front
-    from app.tuning.tune import Part, Runs, SearchPlan, parallel_runs
+    from app.tuning.tune import Part, SearchPlan, parallel_runs
     from app.tuning.tune import tune as find
 
     dimensions = parse_dimensions(parameters)
@@ -107,7 +107,7 @@ def tune(
     part = Part(start, duration)
     rest = part.next(held_back) if held_back != 0 and not marks else None
     run = runner(jobs or parallel_runs(wanted), cluster, cluster_data, quiet=True)
-    runs = Runs(subjects, wanted, out, run, start)
+    plan = SearchPlan(subjects, dimensions, wanted, part, rest, search, trials, seed)
     compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:
 
@@ -116,8 +116,7 @@ def tune(
             if best := front(so_far, wanted):
                 bar.set_postfix_str(f"best {wanted[0].text(best[0].scores[0])}")
 
-        plan = SearchPlan(dimensions, wanted, part, subjects[0].params, rest, search, trials, seed)
-        done, checked = find(runs, plan, out, progress)
+        done, checked = find(plan, out, run, progress)
     best = front(done, wanted)
     if not best:
         raise HemislamError(f"No trial gave a result: {done[0].error or 'no run has a value for the objective'}")

@@ -76,7 +76,7 @@ def choose_objectives(names: Sequence[str], subjects: "Sequence[Subject]") -> tu
     return tuple(chosen)
 
 
-def score(objective: Objective, outcomes: "Sequence[Outcome]") -> float | None:
+def mean_score(objective: Objective, outcomes: "Sequence[Outcome]") -> float | None:
     """The mean over all recordings; None if a recording has no value."""
     values = [objective.of(outcome) for outcome in outcomes]
     if any(value is None or not np.isfinite(value) for value in values):

@@ -70,16 +70,15 @@ def find(owner: Link, wanted: Wanted) -> None:
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import importances
     from app.tuning.space import parse_dimensions
-    from app.tuning.tune import Part, Runs, SearchPlan, parallel_runs, tune
+    from app.tuning.tune import Part, SearchPlan, parallel_runs, tune
 
     truth = read_truth(str(wanted.truth)) if wanted.truth is not None else None
     subject = Subject(wanted.recording.stem, wanted.recording, wanted.params, truth, marks=wanted.marks)
     objectives = choose_objectives(wanted.objectives, [subject])
     part = Part(wanted.start_s, wanted.duration_s)
     rest = part.next() if not wanted.marks else None  # only this part has marks
-    search = SearchPlan(
-        parse_dimensions(wanted.parameters), objectives, part, wanted.params, rest, wanted.how, wanted.trials
-    )
+    dimensions = parse_dimensions(wanted.parameters)
+    plan = SearchPlan([subject], dimensions, objectives, part, rest, wanted.how, wanted.trials)
     count, latest = 0, Tried()
 
     def ended(ran: bool) -> None:
@@ -94,6 +93,5 @@ def find(owner: Link, wanted: Wanted) -> None:
         owner.send(latest)
 
     run = partial(run_jobs, parallel=parallel_runs(objectives), quiet=True, ended=ended)
-    runs = Runs([subject], objectives, wanted.folder, run, wanted.start_s)
-    _, checked = tune(runs, search, wanted.folder, progress)
+    _, checked = tune(plan, wanted.folder, run, progress)
     owner.send(replace(latest, held_back=checked, finished=True))

@@ -15,10 +15,9 @@ from app.evaluation.evaluate import Subject, check_subject
 from app.evaluation.job import LEAD_S, Job, read_run
 from app.evaluation.measured import load, measure
 from app.evaluation.runner import RunJobs
-from app.slam.params import Params
 from app.slam.provenance import cores
 from app.slam.text_files import make_folder
-from app.tuning.objectives import Objective, score
+from app.tuning.objectives import Objective, mean_score
 from app.tuning.report import write_results
 from app.tuning.space import Dimension, grid
 from app.tuning.trial import SearchMethod, Trial, beats, front
@@ -57,67 +56,52 @@ class SearchPlan:
     """The plan of a search.
 
     Attributes:
-        given: the given parameters of the first recording; the search learns from them as from any trial.
-        rest: a part held back, on which the best settings are checked. trials: number of settings besides `given`.
+        subjects: the recordings; the search learns from the given parameters of the first one as from any trial.
+        rest: a part held back, on which the best settings are checked. trials: number of settings besides the given.
     """
 
+    subjects: Sequence[Subject]
     dimensions: Sequence[Dimension]
     objectives: Sequence[Objective]
-    part: Part
-    given: Params
+    part: Part = Part()
     rest: Part | None = None
     how: SearchMethod = "bayes"
     trials: int = 100
     seed: int = 0
 
 
+Scores = tuple[tuple[float | None, ...], str]
+"""The scores of a setting by objective, and why it failed ("" if it did not)."""
+Score = Callable[[Sequence[Mapping[str, Any]], Part], list[Scores]]
+"""Runs settings on a part of the recordings."""
+
+
 class Runs:
-    """Runs settings on all recordings and scores them.
+    """Runs settings on the recordings of a plan and scores them.
 
     Args:
-        folder: of the search; finished runs beside it are reused. run: as in `evaluate`. start_s: of the part.
+        folder: of the search; finished runs beside it are reused. run: as in `evaluate`.
 
     Raises:
         HemislamError: a recording cannot be used, or ends before the part.
     """
 
-    def __init__(
-        self,
-        subjects: Sequence[Subject],
-        objectives: Sequence[Objective],
-        folder: Path,
-        run: RunJobs,
-        start_s: float = 0.0,
-    ) -> None:
-        self._subjects, self._objectives, self._run = subjects, objectives, run
+    def __init__(self, plan: SearchPlan, folder: Path, run: RunJobs) -> None:
+        self._plan, self._run = plan, run
         self._folder, self._known = folder / "runs", _known_runs(folder.resolve().parent)
-        self.hashes = [check_subject(subject, start_s) for subject in subjects]
+        self.hashes = [check_subject(subject, plan.part.start_s) for subject in plan.subjects]
 
-    def asked(self, wanted: SearchPlan) -> dict[str, Any]:
-        """The request for a search, as kept in its report."""
-        return {
-            "recordings": [
-                {"path": str(one.recording), "sha256": sha256, "parameters": one.params.model_dump(mode="json")}
-                for one, sha256 in zip(self._subjects, self.hashes, strict=True)
-            ],
-            "search": wanted.how,
-            "trials": wanted.trials,
-            "seed": wanted.seed,
-            "part_s": [wanted.part.start_s, wanted.part.duration_s],
-        }
-
-    def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[tuple[tuple[float | None, ...], str]]:
-        """The scores of each setting by objective, and why it failed ("" if it did not)."""
-        jobs = [[self._job(index, setting, part) for index in range(len(self._subjects))] for setting in settings]
+    def score(self, settings: Sequence[Mapping[str, Any]], part: Part) -> list[Scores]:
+        recordings = list(zip(self._plan.subjects, self.hashes, strict=True))
+        jobs = [[self._job(*recording, setting, part) for recording in recordings] for setting in settings]
         each = {job.folder: job for of_setting in jobs for job in of_setting}
         errors = self._run(list(each.values()))
         return [self._scored(of_setting, errors) for of_setting in jobs]
 
-    def _job(self, index: int, values: Mapping[str, Any], part: Part) -> Job:
-        subject = self._subjects[index]
+    def _job(self, subject: Subject, sha256: str, values: Mapping[str, Any], part: Part) -> Job:
         job = Job(
             recording=subject.recording,
-            sha256=self.hashes[index],
+            sha256=sha256,
             name=subject.name,
             variant="",
             params=subject.params.with_values(values),
@@ -130,16 +114,15 @@ class Runs:
         name = job.key[:16]
         return replace(job, variant=name, folder=self._known.get(job.key, self._folder / subject.name / name))
 
-    def _scored(
-        self, jobs: Sequence[Job], errors: Mapping[tuple[str, str], str]
-    ) -> tuple[tuple[float | None, ...], str]:
-        failed = [error for job in jobs if (error := errors.get((job.name, job.variant)))]
-        if failed:
-            return (None,) * len(self._objectives), failed[0]
+    def _scored(self, jobs: Sequence[Job], errors: Mapping[tuple[str, str], str]) -> Scores:
+        objectives = self._plan.objectives
+        if failed := [error for job in jobs if (error := errors.get((job.name, job.variant)))]:
+            return (None,) * len(objectives), failed[0]
         outcomes = [
-            measure([load(job, "")], subject.truth)[0][0] for job, subject in zip(jobs, self._subjects, strict=True)
+            measure([load(job, "")], subject.truth)[0][0]
+            for job, subject in zip(jobs, self._plan.subjects, strict=True)
         ]
-        return tuple(score(objective, outcomes) for objective in self._objectives), ""
+        return tuple(mean_score(objective, outcomes) for objective in objectives), ""
 
 
 def parallel_runs(objectives: Sequence[Objective]) -> int:
@@ -151,45 +134,56 @@ OnTrials = Callable[[Sequence[Trial], optuna.Study], None]
 """Called with all trials so far after each batch."""
 
 
-def tune(runs: Runs, wanted: SearchPlan, folder: Path, progress: OnTrials) -> tuple[list[Trial], tuple[Trial, ...]]:
+def tune(plan: SearchPlan, folder: Path, run: RunJobs, progress: OnTrials) -> tuple[list[Trial], tuple[Trial, ...]]:
     """Search, check the best settings on the part held back, and write the files of `write_results` into `folder`.
 
     Returns:
         All trials, and those that were run again on the part held back.
 
     Raises:
-        HemislamError: a grid has more points than trials, or the folder cannot be written to.
+        HemislamError: as `Runs`, or a grid has more points than trials, or the folder cannot be written to.
     """
-    if wanted.how == "grid":
-        grid(wanted.dimensions, wanted.trials)  # fails before anything runs
+    runs = Runs(plan, folder, run)
+    if plan.how == "grid":
+        grid(plan.dimensions, plan.trials)  # fails before anything runs
     make_folder(folder / "runs")
-    done, study = search(runs, wanted, progress)
-    checked = check(runs, done, wanted.objectives, wanted.rest)
-    write_results(folder, done, checked, wanted.objectives, study, runs.asked(wanted))
+    done, study = search(runs.score, plan, progress)
+    checked = check(runs.score, plan, done)
+    request = {
+        "recordings": [
+            {"path": str(one.recording), "sha256": sha256, "parameters": one.params.model_dump(mode="json")}
+            for one, sha256 in zip(plan.subjects, runs.hashes, strict=True)
+        ],
+        "search": plan.how,
+        "trials": plan.trials,
+        "seed": plan.seed,
+        "part_s": [plan.part.start_s, plan.part.duration_s],
+    }
+    write_results(folder, done, checked, plan.objectives, study, request)
     return done, checked
 
 
 def search(
-    runs: Runs, wanted: SearchPlan, progress: OnTrials = lambda so_far, study: None
+    score: Score, plan: SearchPlan, progress: OnTrials = lambda so_far, study: None
 ) -> tuple[list[Trial], optuna.Study]:
     """Try the given parameters and then the settings. Raises HemislamError as `tune` does for a grid."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in wanted.objectives])
-    ((scores, error),) = runs.score([{}], wanted.part)
+    study = optuna.create_study(directions=["maximize" if one.greatest else "minimize" for one in plan.objectives])
+    ((scores, error),) = score([{}], plan.part)
     done = [Trial(0, {}, scores, error)]
-    values = {one.path: wanted.given.value(one.path) for one in wanted.dimensions}
-    if done[0].complete and all(one.holds(values[one.path]) for one in wanted.dimensions):
+    values = {one.path: plan.subjects[0].params.value(one.path) for one in plan.dimensions}
+    if done[0].complete and all(one.holds(values[one.path]) for one in plan.dimensions):
         study.add_trial(
             optuna.trial.create_trial(
                 params=values,
-                distributions={one.path: one.distribution for one in wanted.dimensions},
+                distributions={one.path: one.distribution for one in plan.dimensions},
                 values=[value for value in scores if value is not None],
             )
         )
     progress(done, study)
-    for batch in _batches(study, wanted):
+    for batch in _batches(study, plan):
         settings = [setting for _, setting in batch]
-        for (asked, setting), (scores, error) in zip(batch, runs.score(settings, wanted.part), strict=True):
+        for (asked, setting), (scores, error) in zip(batch, score(settings, plan.part), strict=True):
             trial = Trial(len(done), setting, scores, error)
             done.append(trial)
             if trial.complete:
@@ -200,14 +194,14 @@ def search(
     return done, study
 
 
-def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], rest: Part | None) -> tuple[Trial, ...]:
+def check(score: Score, plan: SearchPlan, trials: Sequence[Trial]) -> tuple[Trial, ...]:
     """The given parameters and the best settings, run on the part held back; empty without such a part or results."""
-    if rest is None or not any(trial.complete for trial in trials):
+    if plan.rest is None or not any(trial.complete for trial in trials):
         return ()
-    best = [trial for trial in front(trials, objectives) if trial.number]
-    best.sort(key=lambda trial: not beats(trial, trials[0], objectives))  # those worse in no objective first
+    best = [trial for trial in front(trials, plan.objectives) if trial.number]
+    best.sort(key=lambda trial: not beats(trial, trials[0], plan.objectives))  # those worse in no objective first
     chosen = [trials[0], *best[:MOST_CHECKED]]
-    results = runs.score([trial.values for trial in chosen], rest)
+    results = score([trial.values for trial in chosen], plan.rest)
     return tuple(
         Trial(one.number, one.values, scores, error) for one, (scores, error) in zip(chosen, results, strict=True)
     )
@@ -216,19 +210,19 @@ def check(runs: Runs, trials: Sequence[Trial], objectives: Sequence[Objective], 
 Batch = list[tuple[optuna.trial.Trial, Mapping[str, Any]]]
 
 
-def _batches(study: optuna.Study, wanted: SearchPlan) -> Iterator[Batch]:
-    distributions = {dimension.path: dimension.distribution for dimension in wanted.dimensions}
-    if wanted.how == "grid":
-        settings = grid(wanted.dimensions, wanted.trials)
+def _batches(study: optuna.Study, plan: SearchPlan) -> Iterator[Batch]:
+    distributions = {dimension.path: dimension.distribution for dimension in plan.dimensions}
+    if plan.how == "grid":
+        settings = grid(plan.dimensions, plan.trials)
         for setting in settings:
             study.enqueue_trial(dict(setting))
         for first in range(0, len(settings), BATCH):
             yield [(study.ask(distributions), setting) for setting in settings[first : first + BATCH]]
         return
-    for first in range(0, wanted.trials, BATCH):
-        study.sampler = _sampler(wanted.how, wanted.seed * 10_000 + first)
-        asked = [study.ask(distributions) for _ in range(min(BATCH, wanted.trials - first))]
-        yield [(trial, {one.path: one.rounded(trial.params[one.path]) for one in wanted.dimensions}) for trial in asked]
+    for first in range(0, plan.trials, BATCH):
+        study.sampler = _sampler(plan.how, plan.seed * 10_000 + first)
+        asked = [study.ask(distributions) for _ in range(min(BATCH, plan.trials - first))]
+        yield [(trial, {one.path: one.rounded(trial.params[one.path]) for one in plan.dimensions}) for trial in asked]
 
 
 def _sampler(how: SearchMethod, seed: int) -> optuna.samplers.BaseSampler:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.evaluation.evaluate import Subject
 from app.evaluation.job import Job, finished
 from app.evaluation.run_job import run_job
 from app.mapping.opening import open_session
@@ -81,7 +82,8 @@ def test_five_labelled_frames_find_what_a_fine_grid_over_all_others_finds() -> N
         return Frames(scans, downs, drawn)
 
     few, others = frames(BY_HAND), frames(OTHERS)
-    done, _ = search(few, SearchPlan(parse_dimensions(VARIED), (F1,), Part(), Params(), trials=48))  # type: ignore[arg-type]
+    walk = Subject("walk", Path("walk.mcap"), Params())
+    done, _ = search(few.score, SearchPlan([walk], parse_dimensions(VARIED), (F1,), trials=48))
     found = others.f1(front(done, (F1,))[0].values)
     grid = [
         others.f1({"ground.alpha": float(alpha), "ground.sigma": float(sigma)})

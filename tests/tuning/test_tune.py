@@ -19,6 +19,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from app.__main__ import cli
+from app.evaluation.evaluate import Subject
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.tuning.objectives import OBJECTIVES, Objective
@@ -29,6 +30,7 @@ from app.tuning.tune import Part, SearchPlan, check, search
 from tests.cli.conftest import write_walk
 
 ATE, F1 = OBJECTIVES["ate"], OBJECTIVES["ground-f1"]
+WALK = Subject("walk", Path("walk.mcap"), Params())
 
 
 class Bowl:
@@ -51,10 +53,8 @@ class Bowl:
 
 def found(how: Any, trials: int = 60, seed: int = 0) -> tuple[list[Trial], Bowl]:
     bowl = Bowl()
-    wanted = SearchPlan(
-        parse_dimensions("ground.alpha,ground.sigma"), (ATE,), Part(), Params(), how=how, trials=trials, seed=seed
-    )
-    done, _ = search(bowl, wanted)  # type: ignore[arg-type]
+    varied = parse_dimensions("ground.alpha,ground.sigma")
+    done, _ = search(bowl.score, SearchPlan([WALK], varied, (ATE,), how=how, trials=trials, seed=seed))
     return done, bowl
 
 
@@ -104,9 +104,10 @@ def test_a_setting_is_proposed_only_if_it_is_better_on_the_part_held_back() -> N
 
 def test_the_best_are_checked_even_where_the_parameters_as_given_failed() -> None:
     trials = [Trial(0, {"ground.alpha": 3.0}, (None,), "lost"), Trial(1, {"ground.alpha": 40.0}, (0.0,))]
-    given, best = check(Bowl(), trials, (ATE,), Part(20.0, 20.0))  # type: ignore[arg-type]
+    plan = SearchPlan([WALK], parse_dimensions("ground.alpha"), (ATE,), rest=Part(20.0, 20.0))
+    given, best = check(Bowl().score, plan, trials)
     assert not given.complete and best.complete and proposal(trials, (given, best), (ATE,)) == best
-    assert check(Bowl(), trials[:1], (ATE,), Part(20.0, 20.0)) == (), "no trial gave a result"  # type: ignore[arg-type]
+    assert check(Bowl().score, plan, trials[:1]) == (), "no trial gave a result"
 
 
 def test_when_no_setting_gives_a_result_held_back_the_advice_says_so() -> None:
@@ -122,11 +123,11 @@ def test_what_gives_up_one_objective_for_another_is_not_proposed() -> None:
 
 
 def test_the_search_learns_from_the_parameters_as_given() -> None:
-    wanted = SearchPlan(parse_dimensions("ground.alpha"), (ATE,), Part(), Params(), trials=4)
-    done, study = search(Bowl(), wanted)  # type: ignore[arg-type]
+    plan = SearchPlan([WALK], parse_dimensions("ground.alpha"), (ATE,), trials=4)
+    done, study = search(Bowl().score, plan)
     assert study.trials[0].params == {"ground.alpha": Params().ground.alpha}
     assert study.trials[0].values == list(done[0].scores)
-    _, narrow = search(Bowl(), replace(wanted, dimensions=parse_dimensions("ground.alpha=50:60")))  # type: ignore[arg-type]
+    _, narrow = search(Bowl().score, replace(plan, dimensions=parse_dimensions("ground.alpha=50:60")))
     assert len(narrow.trials) == 4, "what is given lies outside the range"
 
 
@@ -135,7 +136,7 @@ def test_whole_numbers_vary_on_their_step_wherever_the_range_and_the_given_value
     assert (points.low, points.high, points.grid(4)) == (200, 1900, [200, 800, 1300, 1900])
     for value, learned in ((1000, 1), (1050, 0)):
         given = Params().with_values({"filter.max_points": value})
-        done, study = search(Bowl(), SearchPlan((points,), (ATE,), Part(), given, trials=4))  # type: ignore[arg-type]
+        done, study = search(Bowl().score, SearchPlan([replace(WALK, params=given)], (points,), (ATE,), trials=4))
         assert all(trial.values["filter.max_points"] % 100 == 0 for trial in done[1:])
         assert len(study.trials) == 4 + learned, "what is given is learned from where it lies on the step"
 
