@@ -9,6 +9,7 @@ the recording of each worker are checked before it gets work.
 
 import contextlib
 import logging
+import math
 import os
 import sys
 import tempfile
@@ -68,23 +69,20 @@ class Cluster:
         """
         errors: dict[tuple[str, str], str] = {}
         waiting = {job.folder: job for job in jobs if finished(job) is None}
-        try:
-            with self._client() as client:
-                _checked(client, _workers(client))
-        except _Gone as gone:  # at the start, the cluster must be there
-            raise HemislamError(str(gone)) from None
-        patient_until, told = time.monotonic() + self.wait_s, ""
+        lost_s, told = -math.inf, ""  # when the cluster was lost, 0 while it is there; it must be there at the start
         with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
             while waiting:
                 try:
-                    for job, error in self._results(list(waiting.values())):
-                        del waiting[job.folder]
-                        bar.update()
-                        if error:
-                            errors[job.name, job.variant] = error
-                        patient_until = time.monotonic() + self.wait_s
+                    with self._client() as client:
+                        lost_s = 0.0
+                        for job, error in self._results(client, list(waiting.values())):
+                            del waiting[job.folder]
+                            bar.update()
+                            if error:
+                                errors[job.name, job.variant] = error
                 except _Gone as gone:
-                    if time.monotonic() > patient_until:
+                    lost_s = lost_s or time.monotonic()
+                    if time.monotonic() - lost_s > self.wait_s:
                         kept = (
                             " Finished runs are kept; the same command continues." if len(waiting) < len(jobs) else ""
                         )
@@ -95,39 +93,38 @@ class Cluster:
                     time.sleep(LOOK_S)
         return errors
 
-    def _results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str]]:
+    def _results(self, client: Any, jobs: Sequence[Job]) -> Iterator[tuple[Job, str]]:
         """Yield jobs as they end, with the reason if they failed. Raises _Gone."""
         waiting, running = deque(jobs), dict[str, tuple[Job, Any]]()
         deaths, news = Counter[Path](), threading.Event()
-        with self._client() as client:
-            while waiting or running:
-                there = _workers(client)
-                for worker in running.keys() - there.keys():
-                    job, _ = running.pop(worker)
-                    deaths[job.folder] += 1
-                    if deaths[job.folder] == MOST_DEATHS:
-                        yield job, f"{MOST_DEATHS} workers died while running it; they may have too little memory."
-                    else:
-                        waiting.appendleft(job)
-                free = sorted(there.keys() - running.keys())[: len(waiting)]
-                for worker in _checked(client, {worker: there[worker] for worker in free}):
-                    with contextlib.suppress(_Died):
-                        self._bring(client, worker, waiting[0])
-                        job = waiting.popleft()
-                        key = f"hemislam-{job.key}-{job.name}-{job.variant}-{deaths[job.folder]}"
-                        future = client.submit(_work, job, self.url, key=key, workers=[worker])
-                        future.add_done_callback(lambda _: news.set())
-                        running[worker] = job, future
-                news.wait(LOOK_S)
-                news.clear()
-                for worker, (job, future) in list(running.items()):
-                    if future.done() and (error := _taken(job, future)) is not None:
-                        del running[worker]
-                        yield job, error
+        while waiting or running:
+            there = _workers(client)
+            for worker in running.keys() - there.keys():
+                job, _ = running.pop(worker)
+                deaths[job.folder] += 1
+                if deaths[job.folder] == MOST_DEATHS:
+                    yield job, f"{MOST_DEATHS} workers died while running it; they may have too little memory."
+                else:
+                    waiting.appendleft(job)
+            for worker in sorted(there.keys() - running.keys())[: len(waiting)]:
+                with contextlib.suppress(_Died):
+                    _check(client, worker, there[worker]["nthreads"])
+                    self._bring(client, worker, waiting[0])
+                    job = waiting.popleft()
+                    key = f"hemislam-{job.key}-{job.name}-{job.variant}-{deaths[job.folder]}"
+                    future = client.submit(_work, job, self.url, key=key, workers=[worker])
+                    future.add_done_callback(lambda _: news.set())
+                    running[worker] = job, future
+            news.wait(LOOK_S)
+            news.clear()
+            for worker, (job, future) in list(running.items()):
+                if future.done() and (error := _taken(job, future)) is not None:
+                    del running[worker]
+                    yield job, error
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Any]:
-        """A connected client with at least one worker. Raises _Gone: the scheduler cannot be reached, or was lost."""
+        """A connected client with at least one worker. Raises _Gone: the scheduler or all workers are not there."""
         from distributed import Client
         from distributed.comm import CommClosedError
 
@@ -140,6 +137,7 @@ class Cluster:
         try:
             with contextlib.suppress(TimeoutError):
                 client.wait_for_workers(1, timeout=CONNECT_S)
+            _workers(client)
             yield client
         except (CommClosedError, TimeoutError):
             raise _Gone(gone) from None
@@ -148,7 +146,7 @@ class Cluster:
 
     def _bring(self, client: Any, worker: str, job: Job) -> None:
         """Copy a job's recording piece by piece to a worker that has no other access to it. Raises _Died."""
-        if self.url or _ask(client, worker, _has, job):
+        if self.url or _ask(client, worker, _here, job):
             return
         if job.recording.is_dir():
             raise HemislamError(
@@ -179,31 +177,26 @@ def _workers(client: Any) -> dict[str, Any]:
     return workers
 
 
-def _checked(client: Any, workers: dict[str, Any]) -> list[str]:
-    """Addresses of the workers that answer and can be used.
+def _check(client: Any, worker: str, threads: int) -> None:
+    """Check that a worker can be used. Raises _Died.
 
     Raises:
-        HemislamError: a worker has another version or no hemislam, or runs several jobs at a time.
+        HemislamError: it has another version or no hemislam, or runs several jobs at a time.
     """
-    good = []
-    for worker, version in (client.run(_version, workers=list(workers), on_error="return") if workers else {}).items():
-        if isinstance(version, OSError):
-            continue  # it has just died
-        threads = workers[worker]["nthreads"]
-        if threads > 1:
-            raise HemislamError(
-                f"Worker {worker} runs {threads} jobs at a time in one process, which spoils their times;"
-                " start it with --nthreads 1."
-            )
-        if isinstance(version, ModuleNotFoundError):
-            raise HemislamError(f"Worker {worker} has no hemislam ({version}); install version {__version__} there.")
-        if version != (__version__, code_digest()):
-            other = (
-                f"version {version[0]}" if isinstance(version, tuple) and version[0] != __version__ else "other code"
-            )
-            raise HemislamError(f"Worker {worker} has {other}, and this is {__version__}; install the same on all.")
-        good.append(worker)
-    return good
+    if threads > 1:
+        raise HemislamError(
+            f"Worker {worker} runs {threads} jobs at a time in one process, which spoils their times;"
+            " start it with --nthreads 1."
+        )
+    try:
+        version, code = _ask(client, worker, _version)
+    except ModuleNotFoundError as error:
+        raise HemislamError(
+            f"Worker {worker} has no hemislam ({error}); install version {__version__} there."
+        ) from None
+    if (version, code) != (__version__, code_digest()):
+        other = "other code" if version == __version__ else f"version {version}"
+        raise HemislamError(f"Worker {worker} has {other}, and this is {__version__}; install the same on all.")
 
 
 def _taken(job: Job, future: Any) -> str | None:
@@ -222,7 +215,9 @@ def _taken(job: Job, future: Any) -> str | None:
         return f"The worker failed: {str(error) or type(error).__name__}"
     if isinstance(files, str):
         return files
-    _keep(job, files)
+    reopen(job)
+    for name in RUN_FILES:
+        (job.folder / name).write_bytes(files[name])
     return ""
 
 
@@ -230,16 +225,12 @@ def _version() -> tuple[str, str]:
     return __version__, code_digest()
 
 
-def _has(job: Job) -> bool:
-    """Whether this worker has the recording, at its own path or as a copy."""
-    return any(_is_it(path, job.sha256) for path in (job.recording, _copy_of(job)))
-
-
-def _is_it(path: Path, sha256: str) -> bool:
-    if not path.exists():
-        return False
-    facts = path.stat()
-    return _hash(path, facts.st_size, facts.st_mtime_ns) == sha256
+def _here(job: Job) -> Path | None:
+    """Where this worker has the recording: at its own path, or a copy; None if nowhere."""
+    for path in (job.recording, _copy_of(job)):
+        if path.exists() and _hash(path, path.stat().st_size, path.stat().st_mtime_ns) == job.sha256:
+            return path
+    return None
 
 
 @cache
@@ -296,14 +287,13 @@ def _found(job: Job, url: str) -> Path:
     Raises:
         HemislamError: there is no recording with the right content, or it cannot be fetched.
     """
-    if _is_it(job.recording, job.sha256):
-        return job.recording
-    copy = _copy_of(job)
-    if url and not _is_it(copy, job.sha256):
+    path = _here(job)
+    if path is None and url:
         _fetch(f"{url.rstrip('/')}/{job.recording.name}", job)
-    if not _is_it(copy, job.sha256):
+        path = _here(job)
+    if path is None:
         raise HemislamError(f"The worker has no {job.recording.name} with the same content as here.")
-    return copy
+    return path
 
 
 def _fetch(address: str, job: Job) -> None:
@@ -325,9 +315,3 @@ def _fetch(address: str, job: Job) -> None:
         why = cause or ("it is not there" if isinstance(error, FileNotFoundError) else error)
         raise HemislamError(f"The worker cannot fetch {address}: {str(why) or type(why).__name__}") from None
     _settle(job)
-
-
-def _keep(job: Job, files: dict[str, bytes]) -> None:
-    reopen(job)
-    for name in RUN_FILES:
-        (job.folder / name).write_bytes(files[name])

@@ -91,19 +91,21 @@ def test_a_cluster_gives_the_tables_of_one_machine_though_processes_die(
     site: Site, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker is killed when the first run has come, and everything is restarted when the second has."""
-    kept, keep = list[str](), cluster._keep
+    kept, take = list[str](), cluster._taken
     monkeypatch.setattr(cluster, "TAKE_S", 2.0)
 
-    def keep_and_kill(job: Job, files: dict[str, bytes]) -> None:
-        keep(job, files)
+    def take_and_kill(job: Job, future: Any) -> str | None:
+        if (error := take(job, future)) != "":
+            return error
         kept.append(job.variant)
         if len(kept) == 1:
             site.workers[0].send_signal(signal.SIGKILL)
         elif len(kept) == 2:
             monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
             site.restart(after_s=2.5)  # one attempt to connect fails, at least
+        return ""
 
-    monkeypatch.setattr(cluster, "_keep", keep_and_kill)
+    monkeypatch.setattr(cluster, "_taken", take_and_kill)
     result = evaluate(recording, tmp_path / "cluster", "--cluster", site.address)
     assert result.exit_code == 0, result.output
     assert len(kept) == len(set(kept)) == 4, "every run is done once"
@@ -126,7 +128,7 @@ def test_a_worker_without_the_recording_is_sent_it(
             away.unlink()
 
     monkeypatch.setattr(Cluster, "_bring", bring_once)
-    monkeypatch.setattr(cluster, "_has", lambda job: False)
+    monkeypatch.setattr(cluster, "_here", lambda job: None)
     monkeypatch.setattr(cluster, "PIECE", 100_000)
     jobs = [job_of(away, tmp_path / name) for name in ("first", "again")]
     assert Cluster(site.address).run_jobs(jobs) == {}
