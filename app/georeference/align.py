@@ -109,7 +109,7 @@ def align(
     rows = np.flatnonzero(path.within_search(seconds))
     if len(rows) < FEWEST:
         raise _too_few(path, seconds)
-    fixes, seconds = Fixes.of(fixes.stamps_ns[rows], fixes.places[rows], fixes.sigmas[rows]), seconds[rows]
+    fixes, seconds = Fixes(fixes.stamps_ns[rows], fixes.places[rows], fixes.sigmas[rows]), seconds[rows]
     ground = Ground.of(fixes, grid)
     notes: list[str] = []
     arm = np.array(lever or (0.0, 0.0, 0.0))
@@ -389,9 +389,9 @@ def _refuse_unlike(solved: _Solved, places: F64) -> None:
 
 def _refuse_swapped(path: PathOverTime, seconds: F64, fixes: Fixes, median: float) -> None:
     """Raises HemislamError if the fixes fit far better with latitude and longitude exchanged: a mirrored path."""
-    if (np.abs(fixes.longitude) > 84).any() or median < 0.5:
+    if (np.abs(fixes.places[:, 1]) > 84).any() or median < 0.5:
         return
-    swapped = Fixes(fixes.stamps_ns, fixes.longitude, fixes.latitude, fixes.height, fixes.sigmas)
+    swapped = replace(fixes, places=fixes.places[:, [1, 0, 2]])
     _, other = _coarse(path, seconds, Ground.of(swapped).places, np.zeros(3))
     if other < 0.3 * median:
         raise HemislamError(

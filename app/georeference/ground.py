@@ -27,11 +27,12 @@ class Ground:
     @classmethod
     def of(cls, fixes: Fixes, name: str = "") -> "Ground":
         """Raises HemislamError: the grid does not exist, or is not made for the place."""
-        middle = [float(np.median(column)) for column in (fixes.latitude, fixes.longitude, fixes.height)]
-        name = name or crs.utm(middle[0], middle[1])
-        crs.check_place(name, middle[0], middle[1])
-        flat = crs.transformer(crs.WGS84, name).transform(fixes.longitude, fixes.latitude)
-        return cls.in_grid(np.column_stack([*flat, fixes.height]), name)
+        latitude, longitude, height = fixes.places.T
+        middle = float(np.median(latitude)), float(np.median(longitude))
+        name = name or crs.utm(*middle)
+        crs.check_place(name, *middle)
+        flat = crs.transformer(crs.WGS84, name).transform(longitude, latitude)
+        return cls.in_grid(np.column_stack([*flat, height]), name)
 
     @classmethod
     def in_grid(cls, grid: F64, name: str) -> "Ground":

@@ -35,15 +35,16 @@ def fix_of(message: Any) -> Fixes:
 
 def navsat_message(fixes: Fixes, index: int) -> Any:
     """One of the fixes as NavSatFix."""
+    latitude, longitude, height = fixes.places[index].tolist()
     variances = fixes.sigmas[index] ** 2
     known = bool(np.isfinite(variances).all())
     return new(
         NAVSAT,
         header=header(int(fixes.stamps_ns[index]), "gnss"),
         status=new("sensor_msgs/msg/NavSatStatus", status=0, service=1),
-        latitude=float(fixes.latitude[index]),
-        longitude=float(fixes.longitude[index]),
-        altitude=float(fixes.height[index]),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=height,
         position_covariance=np.diag(variances).ravel() if known else np.zeros(9),
         position_covariance_type=_DIAGONAL if known else _UNKNOWN,
     )
@@ -56,7 +57,6 @@ def recorded_fixes(recording: Path) -> Fixes:
         if not topic:
             raise HemislamError(f"{recording} has no topic of type {NAVSAT} with fixes; give a file of fixes.")
         every = [fix_of(message) for _, _, message in source.messages((topic,))]
-    columns = ("stamps_ns", "latitude", "longitude", "height", "sigmas")
-    return Fixes(*(np.concatenate([getattr(fix, name) for fix in every]) for name in columns)).sound(
-        f"Topic {topic} of {recording}"
-    )
+    columns = ("stamps_ns", "places", "sigmas")
+    fixes = Fixes(*(np.concatenate([getattr(fix, name) for fix in every]) for name in columns))
+    return fixes.sound(f"Topic {topic} of {recording}")

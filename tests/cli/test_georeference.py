@@ -31,7 +31,7 @@ def made() -> Walked:
 def results(made: Walked, tmp_path: Path) -> Path:
     write_tum(tmp_path / "trajectory.tum", made.trajectory)
     fixes = made.fixes
-    rows = np.column_stack([fixes.latitude, fixes.longitude, fixes.height, fixes.sigmas])
+    rows = np.column_stack([fixes.places, fixes.sigmas])
     lines = [
         ",".join([stamp_text(stamp), *map(repr, row)])
         for stamp, row in zip(fixes.stamps_ns.tolist(), rows.tolist(), strict=True)

@@ -139,7 +139,7 @@ def test_a_straight_walk_with_the_antenna_above_shows_no_lever_arm_and_says_so()
 
 def test_swapped_latitude_and_longitude_are_recognised_by_the_mirrored_path() -> None:
     fixes = walked().fixes
-    swapped = Fixes(fixes.stamps_ns, fixes.longitude, fixes.latitude, fixes.height, fixes.sigmas)
+    swapped = Fixes(fixes.stamps_ns, fixes.places[:, [1, 0, 2]], fixes.sigmas)
     with pytest.raises(HemislamError, match="seem to be swapped"):
         align(walked().trajectory, swapped)
 

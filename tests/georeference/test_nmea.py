@@ -13,8 +13,7 @@ DAY_S = 86_400
 
 def test_the_usual_example_is_munich_at_592_metres_above_the_ellipsoid() -> None:
     fixes, ellipsoidal = nmea.read([GGA], "log", 0)
-    place = float(fixes.latitude[0]), float(fixes.longitude[0]), float(fixes.height[0])
-    assert place == pytest.approx((48.1173, 11.516667, 592.3), abs=1e-6) and ellipsoidal
+    assert fixes.places[0].tolist() == pytest.approx([48.1173, 11.516667, 592.3], abs=1e-6) and ellipsoidal
 
 
 def test_the_day_is_that_of_the_recording_also_across_midnight() -> None:
@@ -74,7 +73,7 @@ def test_a_date_of_zda_counts_only_while_there_is_a_fix(void: str) -> None:
 def test_a_sentence_that_cannot_be_is_ignored_though_its_checksum_is_right(absurd: str) -> None:
     for lines in ([GGA, sentence(absurd), GGA], [sentence(absurd), GGA, GGA]):
         fixes, _ = nmea.read(lines, "log", 764_426_000 * 10**9)
-        assert (fixes.stamps_ns == 764_426_119 * 10**9).all() and fixes.latitude == pytest.approx(48.1173)
+        assert (fixes.stamps_ns == 764_426_119 * 10**9).all() and fixes.places[:, 0] == pytest.approx(48.1173)
 
 
 def test_sigmas_come_from_gst_and_belong_to_the_fix_of_the_same_time() -> None:
@@ -100,7 +99,7 @@ def test_heights_of_one_log_are_all_above_the_same_surface() -> None:
     """A receiver that leaves the geoid's height out once would lift this fix by 47 m off its neighbours."""
     without = "$GPGGA,123520,4807.038,N,01131.000,E,1,08,0.9,545.4,M,,M,,*58"
     fixes, ellipsoidal = nmea.read([GGA, without, GGA], "log", 0)
-    assert fixes.height.tolist() == [545.4] * 3 and not ellipsoidal
+    assert fixes.places[:, 2].tolist() == [545.4] * 3 and not ellipsoidal
 
 
 @pytest.mark.parametrize("line", [GGA[:-1] + "8", GGA.replace(",1,08", ",0,08"), GGA[:30], "noise", ""])

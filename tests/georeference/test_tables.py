@@ -29,7 +29,7 @@ def test_a_table_with_sigmas_is_read_to_the_last_digit_of_its_times(tmp_path: Pa
     )
     fixes, height = read_fixes(written(tmp_path, text), NEAR_NS)
     assert fixes.stamps_ns.tolist() == [1_700_000_000_123_456_789 + k * 10**9 for k in range(3)]
-    np.testing.assert_array_equal(fixes.latitude, [48.10, 48.11, 48.12])
+    np.testing.assert_array_equal(fixes.places[:, 0], [48.10, 48.11, 48.12])
     np.testing.assert_array_equal(fixes.sigmas[1], [0.01, 0.02, 0.03])
     assert height == "ellipsoidal"
 
@@ -40,7 +40,7 @@ def test_dates_are_read_and_rows_are_brought_in_order_of_time(tmp_path: Path) ->
     )
     fixes, _ = read_fixes(written(tmp_path, text), NEAR_NS)
     assert fixes.stamps_ns.tolist() == [NEAR_NS + k * 10**9 for k in range(3)]
-    assert fixes.longitude.tolist() == [11.0, 11.1, 11.2] and np.isnan(fixes.sigmas).all()
+    assert fixes.places[:, 1].tolist() == [11.0, 11.1, 11.2] and np.isnan(fixes.sigmas).all()
 
 
 def test_a_walk_across_the_antimeridian_stays_in_one_place(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_seconds_of_the_gps_week_become_utc_by_the_recordings_week_and_leap_seco
     text = H2LID + "".join(f"{2 * 86400 + 80000 + 18 + k}.5{ROW}" for k in range(3))
     fixes, height = read_fixes(written(tmp_path, text), NEAR_NS + 3600 * 10**9)
     assert fixes.stamps_ns.tolist() == [NEAR_NS + 500_000_000 + k * 10**9 for k in range(3)]
-    assert (fixes.height[0], fixes.longitude[0], height) == (17.899, 114.3526809197, "ellipsoidal")
+    assert (*fixes.places[0, 1:], height) == (114.3526809197, 17.899, "ellipsoidal")
 
 
 def test_a_log_of_a_receiver_is_recognised_by_its_sentences(tmp_path: Path) -> None:
