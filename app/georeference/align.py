@@ -124,9 +124,8 @@ def align(
         ground.places[known],
         fixes.sigmas[known],
         overrides_of(overridden, names),
-        arm,
-        offset if offset_s is None else None,
-        lever is None,
+        np.r_[np.zeros(6), offset, arm],
+        np.array([True] * 6 + [offset_s is None] + [lever is None] * 3),
     )
     if (blind := np.isnan(problem.sigmas.sum(axis=1))).any():
         which = "The fixes have" if blind.all() else f"{blind.sum()} of {len(blind)} fixes have"
@@ -135,19 +134,19 @@ def align(
         scatter = float(np.median(problem.solve().distances)) / MEDIAN_SIGMAS
         problem = replace(problem, sigmas=np.where(blind[:, None], problem.sigmas * scatter, problem.sigmas))
     solved = problem.solve()
-    if lever is None and not solved.lever_sigma < WORST_LEVER_M:
+    if lever is None and not solved.deviations[LEVER].max() < WORST_LEVER_M:
         notes.append(
             "The motion does not determine the antenna's lever arm; it is taken as zero. Give it if you know it."
         )
-        problem = replace(problem, lever_free=False)
+        problem = problem.without(LEVER)
         solved = problem.solve()
-    if offset_s is None and not solved.offset_sigma < WORST_OFFSET_S:
+    if offset_s is None and not solved.deviations[OFFSET] < WORST_OFFSET_S:
         notes.append("The motion does not determine the clock offset; it is taken as zero.")
-        problem = replace(problem, offset=None)
+        problem = problem.without(OFFSET)
         solved = problem.solve()
-    if not solved.yaw_sigma < WORST_YAW:
+    if not (sigma := solved.deviations[YAW]) < WORST_YAW:
         raise HemislamError(
-            f"The fixes determine the map's heading only to {np.degrees(solved.yaw_sigma):.0f}°; walk farther outdoors."
+            f"The fixes determine the map's heading only to {np.degrees(sigma):.0f}°; walk farther outdoors."
         )
     _refuse_unlike(solved, problem.places)
     scatter = float(np.median(solved.distances[solved.used])) / MEDIAN_SIGMAS
@@ -157,20 +156,20 @@ def align(
             " less accurate than that."
         )
     solved = problem.with_drift(solved)
-    reference = ground.reference(solved.rotation, solved.shift, height)
+    x, y, z = solved.x[LEVER].tolist()
     return Alignment(
-        reference,
+        ground.reference(_rotation(solved.x), solved.x[SHIFT], height),
         names,
         ground.grid[known],
         solved.residuals,
         solved.distances,
         solved.used,
-        solved.offset + (offset_s or 0.0),
-        solved.offset_sigma,
-        solved.yaw_sigma,
-        (float(solved.lever[0]), float(solved.lever[1]), float(solved.lever[2])),
-        solved.lever_sigma,
-        tuple(notes),
+        offset_s=float(solved.x[OFFSET]) + (offset_s or 0.0),
+        offset_sigma_s=float(solved.deviations[OFFSET]),
+        yaw_sigma=float(solved.deviations[YAW]),
+        lever_arm=(x, y, z),
+        lever_sigma=float(solved.deviations[LEVER].max()),
+        notes=tuple(notes),
     )
 
 
@@ -179,21 +178,19 @@ def overrides_of(overridden: Mapping[str, bool], names: Sequence[str]) -> F64:
     return np.array([float(overridden.get(name, np.nan)) for name in names], np.float64)
 
 
+YAW, SHIFT, TILT, OFFSET, LEVER = 0, slice(1, 4), slice(4, 6), 6, slice(7, 10)
+"""Where the unknowns x (10,) hold yaw, rad; shift, m; tilt, rad; the clocks' offset, s; the lever arm, m."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """As in `Alignment`, with the unknowns x, and the rotation (3, 3) and shift (3,) from the map to the ground."""
+    """As in `Alignment`, with the unknowns x (10,) and their standard deviations (10,), nan where a value was given."""
 
     x: F64
-    rotation: F64
-    shift: F64
-    offset: float
-    lever: F64
+    deviations: F64
     residuals: F64
     distances: F64
     used: Mask
-    offset_sigma: float
-    yaw_sigma: float
-    lever_sigma: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,8 +199,7 @@ class _Problem:
 
     Attributes:
         overrides: (n,) 1 or 0 where the user says that a fix counts or does not, nan elsewhere.
-        lever: m, IMU frame, as given. offset: s, to start from; None: not estimated.
-        lever_free: whether the lever arm is estimated instead.
+        given: (10,) offset and lever arm as given, or to start from. free: (10,) whether an unknown is estimated.
     """
 
     path: PathOverTime
@@ -211,51 +207,41 @@ class _Problem:
     places: F64
     sigmas: F64
     overrides: F64
-    lever: F64
-    offset: float | None
-    lever_free: bool
+    given: F64
+    free: Mask
 
     def solve(self) -> _Solved:
         """All unknowns at once, first robustly, then by the fixes that agree."""
-        late, free = self.offset is not None, self.lever_free
         some = self._part(np.flatnonzero(self.overrides != 0))
         if (count := len(some.seconds)) < FEWEST:
             raise HemislamError(f"Only {count} fixes are left, {FEWEST} are needed; accept some of them again.")
-        start = some._start(self.offset or 0.0)
-        if self.offset is not None and free:
+        start = some._start(self.given[OFFSET])
+        if self.free[OFFSET] and self.free[LEVER].all():
             few = some._part(_evenly(count))
-            fits = [few._fit_robustly(few._start(self.offset + nearby)) for nearby in NEARBY_S]
-            start = min(fits, key=lambda fit: float(fit.cost)).x
+            fits = [few._fit_robustly(few._start(self.given[OFFSET] + nearby)) for nearby in NEARBY_S]
+            start, _ = min(fits, key=lambda fit: fit[1])
         x, used = self._robust(start)
-        R, shift, offset, arm = self._model(x)
         errors = self._errors(x)
-        J = self._jacobian(x, used)
-        spread = max(1.0, float((errors[used] ** 2).sum()) / max(3 * int(used.sum()) - len(x), 1))
-        sigmas = _deviations(J) * spread**0.5
-        return _Solved(
-            x,
-            R,
-            shift,
-            offset,
-            arm,
-            errors * self.sigmas,
-            np.linalg.norm(errors, axis=1),
-            used,
-            float(sigmas[6]) if late else float("nan"),
-            float(sigmas[0]),
-            float(sigmas[-3:].max()) if free else float("nan"),
-        )
+        spread = max(1.0, float((errors[used] ** 2).sum()) / max(3 * int(used.sum()) - int(self.free.sum()), 1))
+        deviations = np.full(len(x), np.nan)
+        deviations[self.free] = _deviations(self._jacobian(x, used)) * spread**0.5
+        return _Solved(x, deviations, errors * self.sigmas, np.linalg.norm(errors, axis=1), used)
 
     def _part(self, rows: I64) -> "_Problem":
         """The same with only these fixes."""
         arrays = ("seconds", "places", "sigmas", "overrides")
         return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
+    def without(self, unknown: int | slice) -> "_Problem":
+        """The same with an unknown that is taken as zero."""
+        given, free = self.given.copy(), self.free.copy()
+        given[unknown], free[unknown] = 0.0, False
+        return replace(self, given=given, free=free)
+
     def _start(self, offset: float) -> F64:
-        """The unknowns to start from with this offset; no tilt, no free lever arm."""
-        yaw, shift, _ = aligned_robustly(self.path.antenna(self.seconds - offset, self.lever), self.places)
-        late, free = self.offset is not None, self.lever_free
-        return np.asarray(np.r_[yaw, shift, 0.0, 0.0, [offset] * late, [0.0] * (3 * free)], np.float64)
+        """The unknowns to start from with this offset; no tilt."""
+        yaw, shift, _ = aligned_robustly(self.path.antenna(self.seconds - offset, self.given[LEVER]), self.places)
+        return np.asarray(np.r_[yaw, shift, 0.0, 0.0, offset, self.given[LEVER]], np.float64)
 
     def with_drift(self, solved: _Solved) -> _Solved:
         """The same, with drift in the standard deviations and with receiver constants that drift hardly affects."""
@@ -263,71 +249,80 @@ class _Problem:
         J = self._jacobian(x, used)
         sigmas, seconds = self.sigmas[used], self.seconds[used]
         influence = np.linalg.pinv(J).T[:-2].reshape(*residuals.shape, -1) / sigmas[..., None]
-        drift = drift_deviations(residuals, influence, seconds)
-        found = replace(
-            solved,
-            yaw_sigma=math.hypot(solved.yaw_sigma, drift[0]),
-            lever_sigma=math.hypot(solved.lever_sigma, drift[-3:].max()),
+        drift, deviations = np.full(len(x), np.nan), solved.deviations.copy()
+        drift[self.free] = drift_deviations(residuals, influence, seconds)
+        deviations[YAW] = math.hypot(deviations[YAW], drift[YAW])
+        deviations[LEVER] = math.hypot(deviations[LEVER].max(), drift[LEVER].max())
+        if not self.free[OFFSET]:
+            return replace(solved, deviations=deviations)
+        constants = self.free.copy()  # yaw, tilt and offset, and the lever arm if it is not given
+        constants[SHIFT] = False  # drift replaces it
+        per_unit = J[:-2].reshape(*residuals.shape, -1)[..., constants[self.free]] * sigmas[..., None]
+        expected = np.full(len(x), np.inf)
+        expected[TILT] = LEVEL
+        change, covariance = constants_despite_drift(
+            residuals, per_unit, seconds, sigmas, x[constants], expected[constants]
         )
-        if self.offset is None:
-            return found
-        but_shift = np.r_[0, 4 : len(x)]  # drift replaces the shift
-        per_unit = J[:-2].reshape(*residuals.shape, -1)[..., but_shift] * sigmas[..., None]
-        expected = np.full(len(but_shift), np.inf)
-        expected[1:3] = LEVEL
-        change, covariance = constants_despite_drift(residuals, per_unit, seconds, sigmas, x[but_shift], expected)
-        offset, arm = solved.offset + float(change[3]), solved.lever.copy()
-        if self.lever_free:
-            arm += change[4:]
-        there = replace(self, seconds=self.seconds - offset, offset=None, lever=arm, lever_free=False).solve()
-        return replace(
-            there,
-            offset=offset,
-            offset_sigma=float(covariance[3, 3] ** 0.5),
-            yaw_sigma=found.yaw_sigma,
-            lever_sigma=found.lever_sigma,
-        )
-
-    def _model(self, x: F64) -> tuple[F64, F64, float, F64]:
-        """Rotation, shift, offset and lever arm of the unknowns."""
-        late = float(x[6]) if self.offset is not None else 0.0
-        R = lie.exp(np.array([0.0, 0.0, x[0]])) @ lie.exp(np.array([x[4], x[5], 0.0]))
-        return R, x[1:4], late, x[-3:] if self.lever_free else self.lever
+        given = x.copy()
+        given[constants] += change
+        deviations[OFFSET] = covariance[3, 3] ** 0.5
+        there = replace(self, given=given, free=np.arange(len(x)) < OFFSET).solve()
+        return replace(there, deviations=deviations)
 
     def _errors(self, x: F64) -> F64:
         """(n, 3) in standard deviations."""
-        R, shift, late, arm = self._model(x)
-        return np.asarray((self.places - self.path.antenna(self.seconds - late, arm) @ R.T - shift) / self.sigmas)
+        antenna = self.path.antenna(self.seconds - x[OFFSET], x[LEVER])
+        return np.asarray((self.places - antenna @ _rotation(x).T - x[SHIFT]) / self.sigmas)
 
     def _whitened(self, x: F64, used: Mask) -> F64:
         """(3 k + 2,) errors of the k fixes that are used, and the tilt among the unknowns, in standard deviations."""
-        return np.concatenate((self._errors(x)[used].ravel(), x[4:6] / LEVEL))
+        return np.concatenate((self._errors(x)[used].ravel(), x[TILT] / LEVEL))
 
     def _jacobian(self, x: F64, used: Mask) -> F64:
-        """(3 k + 2, unknowns) derivatives of these errors."""
-        steps = 1e-5 * np.eye(len(x))
+        """(3 k + 2, unknowns that are estimated) derivatives of these errors."""
+        steps = 1e-5 * np.eye(len(x))[self.free]
         columns = [self._whitened(x + step, used) - self._whitened(x - step, used) for step in steps]
         return np.stack(columns, axis=1) / 2e-5
 
-    def _fit_robustly(self, start: F64) -> Any:
-        """SciPy's result, by all fixes except those that the user leaves out."""
-        return _fit(self._whitened, start, loss="cauchy", f_scale=2.0, args=(self.overrides != 0,))
+    def _fit(self, start: F64, used: Mask, **loss: Any) -> tuple[F64, float]:
+        """The unknowns with which these fixes fit best, and the cost."""
+        from scipy import optimize  # every process imports this module, and few align
+
+        def errors(free: F64) -> F64:
+            x = start.copy()
+            x[self.free] = free
+            return self._whitened(x, used)
+
+        least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
+        fit = least_squares(errors, start[self.free], x_scale="jac", max_nfev=MOST_STEPS, **loss)
+        x = start.copy()
+        x[self.free] = fit.x
+        return x, float(fit.cost)
+
+    def _fit_robustly(self, start: F64) -> tuple[F64, float]:
+        """As `_fit`, by all fixes except those that the user leaves out."""
+        return self._fit(start, self.overrides != 0, loss="cauchy", f_scale=2.0)
 
     def _robust(self, start: F64) -> tuple[F64, Mask]:
         """The optimum by the fixes that agree or that the user counts, and which these are."""
         used = np.asarray(self.overrides != 0)
-        x = np.asarray(self._fit_robustly(start).x)
+        x, _ = self._fit_robustly(start)
         for _ in range(10):
             distances = np.linalg.norm(self._errors(x), axis=1)
             scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
             agree = ((distances < MOST_SIGMAS * scale) | (self.overrides == 1)) & (self.overrides != 0)
             if agree.sum() < 3:
                 break
-            x = np.asarray(_fit(self._whitened, x, args=(agree,)).x)
+            x, _ = self._fit(x, agree)
             if (agree == used).all():
                 break
             used = agree
         return x, used
+
+
+def _rotation(x: F64) -> F64:
+    """(3, 3) from the map to the ground."""
+    return lie.exp(np.array([0.0, 0.0, x[YAW]])) @ lie.exp(np.array([*x[TILT], 0.0]))
 
 
 def _deviations(J: F64) -> F64:
@@ -337,14 +332,6 @@ def _deviations(J: F64) -> F64:
     values, vectors = np.linalg.eigh((J / lengths).T @ (J / lengths))
     values = np.where(values > 1e-12, values, 1e-300)
     return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)) / lengths)
-
-
-def _fit(errors: Any, start: F64, **loss: Any) -> Any:
-    """SciPy's result. errors: of the unknowns (k,), whitened (n,)."""
-    from scipy import optimize  # every process imports this module, and few align
-
-    least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
-    return least_squares(errors, start, x_scale="jac", max_nfev=MOST_STEPS, **loss)
 
 
 def _coarse(path: PathOverTime, seconds: F64, places: F64, lever: F64, *, search: bool = True) -> tuple[float, float]:
