@@ -41,7 +41,7 @@ def write_report(folder: Path, recordings: Sequence[Evaluated]) -> list[str]:
         "variants": {o.name: o.missing or o.meaning or "as given" for o in outcomes},
         "pictures": {recording.name: pictures(recording, colour) for recording in recordings},
         "crop_note": CROP_NOTE,
-        "machines": _machines(recordings),
+        "machines": _by_text(recordings, _machine),
         "parameters": _parameters(recordings),
     }
     texts = {
@@ -110,11 +110,6 @@ def _leaves(entry: Any, path: str = "") -> Iterable[tuple[str, Any]]:
         yield path, entry
 
 
-def _machines(recordings: Sequence[Evaluated]) -> list[str]:
-    """Each machine and version used, with the names of its runs if there are several."""
-    return [f"{text}{_of(who)}" for text, who in _by_text(recordings, _machine)]
-
-
 def _parameters(recordings: Sequence[Evaluated]) -> list[tuple[str, str]]:
     """Every parameter of this engine's runs by dotted name; if runs differ, each value with the names of its runs."""
     found = []
@@ -124,8 +119,7 @@ def _parameters(recordings: Sequence[Evaluated]) -> list[tuple[str, str]]:
             found = run["parameters"][section][name]
             return " ".join(map(str, found)) if isinstance(found, list) else str(found)
 
-        values = _by_text(recordings, value, of_engine=True)
-        text = "; ".join(f"{value}{_of(who)}" for value, who in values)
+        text = "; ".join(_by_text(recordings, value, of_engine=True))
         found.append((leaf.path, f"{text} {leaf.unit}".strip()))
     return found
 
@@ -140,14 +134,15 @@ def _machine(run: dict[str, Any]) -> str:
 
 def _by_text(
     recordings: Sequence[Evaluated], of: Callable[[dict[str, Any]], str], *, of_engine: bool = False
-) -> list[tuple[str, str]]:
-    """The texts that `of` returns for the runs, each once, with the names of its runs; "" if all are the same."""
-    outcomes = [(r.name, outcome) for r in recordings for outcome in r.outcomes if outcome.staged or not of_engine]
-    runs = {(name, outcome.name): of(outcome.run) for name, outcome in outcomes if outcome.run}
-    texts = dict.fromkeys(runs.values())
-    if len(texts) < 2:
-        return [(text, "") for text in texts]
-    return [(text, _names([who for who in runs if runs[who] == text], list(runs))) for text in texts]
+) -> list[str]:
+    """The texts that `of` returns for the runs, each once; if they differ, with the names of its runs."""
+    groups: dict[str, list[_Who]] = {}
+    for recording in recordings:
+        for outcome in recording.outcomes:
+            if outcome.run and (outcome.staged or not of_engine):
+                groups.setdefault(of(outcome.run), []).append((recording.name, outcome.name))
+    every = [who for group in groups.values() for who in group]
+    return [f"{text} ({_names(group, every)})" if len(groups) > 1 else text for text, group in groups.items()]
 
 
 def _names(chosen: Sequence[_Who], every: Sequence[_Who]) -> str:
@@ -157,7 +152,3 @@ def _names(chosen: Sequence[_Who], every: Sequence[_Who]) -> str:
         if sum(who[part] in names for who in every) == len(chosen):
             return ", ".join(names)
     return ", ".join(f"{recording} {variant}" for recording, variant in chosen)
-
-
-def _of(who: str) -> str:
-    return f" ({who})" if who else ""
