@@ -120,18 +120,17 @@ def grid(dimensions: Sequence[Dimension], most: int) -> list[Mapping[str, Any]]:
     Raises:
         HemislamError: even with two values each, there are more settings.
     """
-    least = math.prod(len(dimension.grid(2)) for dimension in dimensions)
-    if least > most:
+
+    def size(points: int) -> int:
+        return math.prod(len(dimension.grid(points)) for dimension in dimensions)
+
+    if size(2) > most:
         raise HemislamError(
-            f"A grid over {len(dimensions)} parameters has at least {least} points, more than {most} trials;"
+            f"A grid over {len(dimensions)} parameters has at least {size(2)} points, more than {most} trials;"
             " search by bayes or random, or vary fewer parameters."
         )
-    points, settings = 2, _grid(dimensions, 2)
-    while len(finer := _grid(dimensions, points + 1)) <= most and points < most:
-        points, settings = points + 1, finer
-    return settings
-
-
-def _grid(dimensions: Sequence[Dimension], points: int) -> list[Mapping[str, Any]]:
+    points = 2
+    while points < most and size(points + 1) <= most:
+        points += 1
     axes = [[(dimension.path, value) for value in dimension.grid(points)] for dimension in dimensions]
     return [dict(setting) for setting in product(*axes)]
