@@ -3,9 +3,12 @@
 Everything that had to be assumed or estimated for this is returned in words, for the report.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from scipy.signal import correlate  # type: ignore[attr-defined]  # scipy ships no types
 from scipy.spatial.transform import Rotation, Slerp
 
 from app.evaluation.truth import TruePoses
@@ -209,11 +212,7 @@ def _correlations(a: F64, b: F64, least: int) -> tuple[I64, F64]:
     x = np.where(known_a, a - np.nanmean(a), 0.0)
     y = np.where(known_b, b - np.nanmean(b), 0.0)
     ma, mb = known_a.astype(np.float64), known_b.astype(np.float64)
-    size = len(a) + len(b) - 1
-
-    def over(u: F64, v: F64) -> F64:
-        return np.fft.irfft(np.fft.rfft(u, size) * np.fft.rfft(v[::-1], size), size)
-
+    over: Callable[[F64, F64], F64] = partial(correlate, method="fft")
     count = np.maximum(np.rint(over(ma, mb)), 1.0)
     sum_x, sum_y = over(x, mb), over(ma, y)
     variance_x = over(x**2, mb) - sum_x**2 / count
