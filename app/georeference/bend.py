@@ -58,9 +58,8 @@ def bend(
     Raises:
         HemislamError: the solver fails.
     """
-    path = PathOverTime(trajectory)
-    before = path.poses(np.asarray((keyframe_stamps_ns - path.start_ns) * 1e-9, np.float64))
-    problem = _Problem(path, keyframe_stamps_ns, before, graph, fixes, found)
+    problem = _problem(PathOverTime(trajectory), keyframe_stamps_ns, graph, fixes, found)
+    before = problem.keyframes
     word = overrides_of(overridden, found.names)
     held, barred = np.asarray(word == 1.0), np.asarray(word == 0.0)
     try:
@@ -69,7 +68,7 @@ def bend(
         offset_s, sigma_s, used = found.offset_s, found.offset_sigma_s, ~barred
         poses = problem.solved(offset_s, before, used, robust=True)
         for _ in range(MOST_ROUNDS):
-            _, distances = _off(problem.priors(offset_s), poses)
+            _, distances = problem.off(offset_s, poses)
             scale = max(1.0, float(np.median(distances[used])) / MEDIAN_SIGMAS)
             agree: Mask = ((distances < MOST_SIGMAS * scale) | held) & ~barred
             if np.isfinite(found.offset_sigma_s):
@@ -80,7 +79,7 @@ def bend(
             used = agree
     except ArithmeticError as error:
         raise HemislamError(f"The graph cannot be solved with these fixes ({error}).") from error
-    off, distances = _off(problem.priors(offset_s), poses)
+    off, distances = problem.off(offset_s, poses)
     moved = float(np.linalg.norm(poses[:, :3, 3] - before[:, :3, 3], axis=1).max())
     return poses @ lie.inverse(before), replace(
         found,
@@ -96,50 +95,45 @@ def bend(
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """A graph and the fixes that bend it.
+    """A graph and the n fixes that bend it.
 
     Attributes:
-        path: the trajectory before. stamps_ns: (k,) of the keyframes. keyframes: (k, 4, 4) T_map_imu before.
-        found: the alignment. Below, (n,) refers to its n fixes.
+        path: the trajectory before. keyframes: (k, 4, 4) T_map_imu before.
+        nearest: (n,) indices of the keyframes that the fixes act on. stamps_ns: (n,).
+        places: (n, 3) m, in the map. covariances: (n, 3, 3) of the places. found: the alignment.
     """
 
     path: PathOverTime
-    stamps_ns: I64
     keyframes: F64
     graph: Sequence[Factor]
-    fixes: Fixes
+    nearest: I64
+    stamps_ns: I64
+    places: F64
+    covariances: F64
     found: Alignment
 
-    def priors(self, offset_s: float) -> list[PositionPrior]:
-        """(n,) priors if the fixes are stamped late by this; each on the keyframe nearest in time by the alignment."""
-        found, rows = self.found, self.rows
-        aligned_ns = self.fixes.stamps_ns[rows] - round(found.offset_s * 1e9)
-        after = np.searchsorted(self.stamps_ns, aligned_ns).clip(max=len(self.stamps_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        nearer = np.abs(self.stamps_ns[before] - aligned_ns) <= np.abs(self.stamps_ns[after] - aligned_ns)
-        nearest = np.where(nearer, before, after)  # the same for every offset, so that the cost has no jumps
-        stamps_ns = self.fixes.stamps_ns[rows] - round(offset_s * 1e9)
+    def arms(self, offset_s: float) -> F64:
+        """(n, 3) m, the antenna in the IMU frame of each fix's keyframe, if the fixes are stamped late by this."""
+        stamps_ns = self.stamps_ns - round(offset_s * 1e9)
         then = self.path.poses(np.asarray((stamps_ns - self.path.start_ns) * 1e-9, np.float64))
-        arms = (lie.inverse(self.keyframes[nearest]) @ then @ np.array([*found.lever_arm, 1.0]))[:, :3]
-        places = found.reference.from_crs(found.grid)
-        scatter = np.linalg.norm(found.residuals, axis=1) / np.maximum(found.distances, 1e-9)
-        sigmas = np.where(np.isfinite(self.fixes.sigmas[rows]), self.fixes.sigmas[rows], scatter[:, None])
-        R = np.array(found.reference.rotation)
-        return [
-            PositionPrior(KeyframeId(0, int(keyframe)), place, R.T @ np.diag(sigma**2) @ R, arm)
-            for keyframe, place, sigma, arm in zip(nearest, places, sigmas, arms, strict=True)
-        ]
+        T_keyframe_then = lie.inverse(self.keyframes[self.nearest]) @ then
+        return np.asarray((T_keyframe_then @ np.array([*self.found.lever_arm, 1.0]))[:, :3])
 
-    @property
-    def rows(self) -> I64:
-        """(n,) indices of the fixes."""
-        return np.array([int(name) - 1 for name in self.found.names])
+    def off(self, offset_s: float, poses: F64) -> tuple[F64, F64]:
+        """(n, 3) m, measured minus map in the map's axes, and (n,) the same in standard deviations."""
+        T = poses[self.nearest]
+        off = self.places - T[:, :3, 3] - np.einsum("nij,nj->ni", T[:, :3, :3], self.arms(offset_s))
+        whitened = np.linalg.solve(self.covariances, off[..., None])[..., 0]
+        return off, np.sqrt(np.einsum("ni,ni->n", off, whitened))
 
     def solved(self, offset_s: float, start: F64, which: Mask, *, robust: bool = False) -> F64:
         """(k, 4, 4) the optimum of the graph and some of the fixes (n,), from `start`."""
-        priors = self.priors(offset_s)
-        chosen = [replace(priors[i], robust=robust) for i in np.flatnonzero(which).tolist()]
-        return optimise(self.keyframes[0], [*self.graph, *chosen], start, free=True)
+        arms = self.arms(offset_s)
+        priors = [
+            PositionPrior(KeyframeId(0, int(self.nearest[i])), self.places[i], self.covariances[i], arms[i], robust)
+            for i in np.flatnonzero(which)
+        ]
+        return optimise(self.keyframes[0], [*self.graph, *priors], start, free=True)
 
     def offset(self, offset_s: float, start: F64, which: Mask) -> tuple[float, float]:
         """The clocks' offset with which graph and fixes agree best, and its standard deviation, s.
@@ -154,11 +148,9 @@ class _Problem:
 
         def slope(late: float) -> float:
             """Slope of half the sum of squares, minimised over all poses, whose derivatives then do not matter."""
-            poses, priors = self.solved(late, start, which), self.priors(late)
-            off, _ = _off(priors, poses)
-            (ahead, _), (behind, _) = (_off(self.priors(late + side), poses) for side in (STEP_S / 4, -STEP_S / 4))
-            weights = np.linalg.inv([prior.covariance for prior in priors])
-            pull = np.einsum("ni,nij,nj->n", (ahead - behind) / (STEP_S / 2), weights, off)
+            poses = self.solved(late, start, which)
+            off, ahead, behind = (self.off(late + side, poses)[0] for side in (0.0, STEP_S / 4, -STEP_S / 4))
+            pull = np.einsum("ni,nij,nj->n", (ahead - behind) / (STEP_S / 2), np.linalg.inv(self.covariances), off)
             slopes.append(float(pull[which].sum()))
             return slopes[-1]
 
@@ -174,16 +166,15 @@ class _Problem:
 
     def stiffness(self, which: Mask) -> float:
         """The smallest factor on the graph's covariances with which the fixes predict one another best."""
-        seconds = (self.fixes.stamps_ns[self.rows] - self.fixes.stamps_ns[self.rows[which][0]]) * 1e-9
+        seconds = (self.stamps_ns - self.stamps_ns[which][0]) * 1e-9
         half = np.asarray(seconds // STRETCH_S % 2 == 0)
         parts = half & which, ~half & which
-        priors = self.priors(self.found.offset_s)
         best, cap, kept = np.inf, 0.0, 1.0
         for factor in STIFFNESS if min(part.sum() for part in parts) >= FEWEST else ():
             stiff, missed = self.scaled(factor), []
             for known, asked in (parts, parts[::-1]):
                 poses = stiff.solved(self.found.offset_s, self.keyframes, known, robust=True)
-                missed.append(_off(priors, poses)[1][asked])
+                missed.append(self.off(self.found.offset_s, poses)[1][asked])
             distances = np.concatenate(missed)
             cap = cap or MOST_SIGMAS * max(1.0, float(np.median(distances)) / MEDIAN_SIGMAS)
             score = float(np.minimum(distances, cap) @ np.minimum(distances, cap))
@@ -193,10 +184,22 @@ class _Problem:
         return kept
 
 
-def _off(priors: Sequence[PositionPrior], poses: F64) -> tuple[F64, F64]:
-    """(n, 3) m, measured minus map in the map's axes, and (n,) the same in standard deviations."""
-    T = poses[[prior.keyframe for prior in priors]]
-    arms = np.array([prior.arm for prior in priors])
-    off = np.array([prior.p_map_imu for prior in priors]) - T[:, :3, 3] - np.einsum("nij,nj->ni", T[:, :3, :3], arms)
-    whitened = np.linalg.solve(np.array([prior.covariance for prior in priors]), off[..., None])[..., 0]
-    return off, np.sqrt(np.einsum("ni,ni->n", off, whitened))
+def _problem(path: PathOverTime, stamps_ns: I64, graph: Sequence[Factor], fixes: Fixes, found: Alignment) -> _Problem:
+    """Each fix acts on the keyframe nearest in time by the alignment. stamps_ns: (k,) of the keyframes."""
+    rows = np.array([int(name) - 1 for name in found.names])
+    aligned_ns = fixes.stamps_ns[rows] - round(found.offset_s * 1e9)
+    # the same keyframes for every offset, so that the cost has no jumps
+    nearest = np.searchsorted(stamps_ns[1:] + stamps_ns[:-1], 2 * aligned_ns)
+    scatter = np.linalg.norm(found.residuals, axis=1) / np.maximum(found.distances, 1e-9)
+    sigmas = np.where(np.isfinite(fixes.sigmas[rows]), fixes.sigmas[rows], scatter[:, None])
+    R = np.array(found.reference.rotation)
+    return _Problem(
+        path,
+        path.poses(np.asarray((stamps_ns - path.start_ns) * 1e-9, np.float64)),
+        graph,
+        nearest,
+        fixes.stamps_ns[rows],
+        found.reference.from_crs(found.grid),
+        np.array([R.T @ np.diag(sigma**2) @ R for sigma in sigmas]),
+        found,
+    )
