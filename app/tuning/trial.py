@@ -34,28 +34,22 @@ class Trial:
 
 def front(trials: Sequence[Trial], objectives: Sequence[Objective]) -> list[Trial]:
     """The Pareto front: trials that no other trial beats, sorted by the first objective, the best first."""
-    signs = [-1.0 if objective.greatest else 1.0 for objective in objectives]
-    costs = {
-        trial.number: [sign * (value or 0.0) for sign, value in zip(signs, trial.scores, strict=True)]
-        for trial in trials
-        if trial.complete
-    }
 
-    def beaten(number: int) -> bool:
-        mine = costs[number]
-        return any(
-            all(a <= b for a, b in zip(theirs, mine, strict=True)) and (theirs != mine or other < number)
-            for other, theirs in costs.items()
-            if other != number
-        )
+    def costs(trial: Trial) -> list[float]:
+        scores = zip(objectives, trial.scores, strict=True)
+        return [-score if one.greatest else score for one, score in scores if score is not None]
 
-    best = [trial for trial in trials if trial.number in costs and not beaten(trial.number)]
-    return sorted(best, key=lambda trial: costs[trial.number])
+    best: list[Trial] = []
+    for trial in sorted((one for one in trials if one.complete), key=lambda one: (costs(one), one.number)):
+        # a trial that beats this one comes before it
+        if not any(all(a <= b for a, b in zip(costs(other), costs(trial), strict=True)) for other in best):
+            best.append(trial)
+    return best
 
 
 def beats(trial: Trial, other: Trial, objectives: Sequence[Objective]) -> bool:
     """Whether one trial is better than the other in some objective and worse in none."""
-    return front((other, trial), objectives) == [trial]
+    return trial != other and front((other, trial), objectives) == [trial]
 
 
 def proposal(trials: Sequence[Trial], held_back: Sequence[Trial], objectives: Sequence[Objective]) -> Trial | None:
