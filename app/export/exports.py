@@ -71,7 +71,7 @@ def _drawn(kind: str, suffix: str) -> Export:
 
     def write(path: Path, results: Results) -> None:
         files = importlib.import_module("app.export.section_files")
-        getattr(files, f"write_{suffix}")(path, results, results.section(kind))
+        getattr(files, f"write_{suffix}")(path, results, getattr(results, kind))
 
     return Export(f"{kind}.{suffix}", meaning, write, kind, by_run=False, extra="plan" if suffix == "dxf" else "")
 

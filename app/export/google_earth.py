@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from app.export.paths import name_of, utc_text
-from app.export.raster import COARSE_CELL, Raster
+from app.export.raster import Raster
 from app.export.results import Results
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
@@ -20,7 +20,7 @@ GROUND, REST = (150, 190, 220), (255, 140, 40)
 
 def write(path: Path, results: Results) -> None:
     """Everything is placed on Google Earth's ground, since its heights do not match those of a survey."""
-    raster = results.raster(on_earth=True, cell=COARSE_CELL)
+    raster = results.coarse_raster
     ElementTree.register_namespace("", KML)
     ElementTree.register_namespace("gx", GX)
     text = ElementTree.tostring(_document(results, raster), encoding="utf-8", xml_declaration=True)

@@ -12,7 +12,7 @@ from rasterio.io import MemoryFile
 from rasterio.transform import from_origin
 from scipy import ndimage
 
-from app.export.raster import COARSE_CELL, Raster
+from app.export.raster import Raster
 from app.export.results import Results
 
 FREE, WALL, UNKNOWN = 254, 0, 205
@@ -23,7 +23,7 @@ LEAST_POINTS = 3
 
 def write_pgm(path: Path, results: Results) -> None:
     """Write a grid of walls, free cells (seen as ground) and unknown cells, in the map's frame."""
-    raster = results.raster(on_earth=False)
+    raster = results.raster_in_map
     seen = raster.ground > 0
     free = seen | ndimage.binary_closing(seen, iterations=2)  # type: ignore[attr-defined]  # no types
     grey = np.where(free, FREE, UNKNOWN).astype(np.uint8)
@@ -34,7 +34,7 @@ def write_pgm(path: Path, results: Results) -> None:
 
 def write_yaml(path: Path, results: Results) -> None:
     """Write the file that nav2's map_server needs with the image."""
-    raster = results.raster(on_earth=False)
+    raster = results.raster_in_map
     x, y = raster.origin[:2]
     path.write_text(
         f"image: occupancy.pgm\nmode: trinary\nresolution: {raster.cell:g}\norigin: [{x:.3f}, {y:.3f}, 0.0]\n"
@@ -45,21 +45,21 @@ def write_yaml(path: Path, results: Results) -> None:
 
 def write_floor_png(path: Path, results: Results) -> None:
     """Write a horizontal slice, black on white; the more points, the darker."""
-    cut = results.raster(on_earth=True).cut
+    cut = results.raster.cut
     grey = 255 - np.minimum(cut * 32, 255)
     Image.fromarray(np.flipud(grey).astype(np.uint8)).save(path, format="PNG")
 
 
 def write_world_file(path: Path, results: Results) -> None:
     """Write the position of floor.png for GIS programs: size and rotation of a pixel, middle of the upper left one."""
-    at = _transform(results.raster(on_earth=True))
+    at = _transform(results.raster)
     numbers = (at.a, at.d, at.b, at.e, at.c + at.a / 2, at.f + at.e / 2)
     path.write_text("".join(f"{number:.4f}\n" for number in numbers), encoding="ascii")
 
 
 def write_dxf(path: Path, results: Results) -> None:
     """Write the outlines of the slice, in metres, on the layer `walls`."""
-    raster = results.raster(on_earth=True)
+    raster = results.raster
     walls = (np.flipud(raster.cut) >= LEAST_POINTS).astype(np.uint8)
     drawing: Any = ezdxf.new("R2010", units=6)
     drawing.layers.add("walls")
@@ -73,14 +73,14 @@ def write_dxf(path: Path, results: Results) -> None:
 
 def write_terrain(path: Path, results: Results) -> None:
     """Write the mean height of the ground in each cell, m; NaN where no ground was seen."""
-    raster = results.raster(on_earth=True, cell=COARSE_CELL)
+    raster = results.coarse_raster
     above = "" if results.where is None else f", {results.where.height}"
     _write_tiff(path, results, raster, raster.height, f"height of the ground, m{above}")
 
 
 def write_density(path: Path, results: Results) -> None:
     """Write the number of points per square metre."""
-    raster = results.raster(on_earth=True, cell=COARSE_CELL)
+    raster = results.coarse_raster
     _write_tiff(path, results, raster, (raster.points / raster.cell**2).astype(np.float32), "points per square metre")
 
 

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from app.export.points import EVERYTHING, Block, Choice, blocks
-from app.export.raster import CELL, Raster, rasterise
+from app.export.raster import CELL, COARSE_CELL, Raster, rasterise
 from app.export.section import Slab, of_box, of_path
 from app.georeference.reference import GeoReference
 from app.slam.errors import HemislamError
@@ -54,8 +54,6 @@ class Results:
     notes: tuple[tuple[int, str], ...] = ()
     progress: Callable[[float], None] = lambda share: None
     sha256: Future[str | None] = field(default_factory=Future, init=False, repr=False)
-    _rasters: dict[tuple[bool, float], Raster] = field(default_factory=dict, init=False, repr=False)
-    _sections: dict[str, Slab] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def frame(self) -> MapFrame:
@@ -84,19 +82,28 @@ class Results:
         if choice.box is not None and not count:
             raise HemislamError("There are no points in the box; choose another one.")
 
-    def raster(self, *, on_earth: bool, cell: float = CELL) -> Raster:
-        """The map from above, computed once for all files that show it."""
-        key = on_earth and self.where is not None, cell
-        if key not in self._rasters:
-            self._rasters[key] = rasterise(self.still_blocks, self.where if on_earth else None, cell)
-        return self._rasters[key]
+    # each of these is computed once for all files that show it
+    @cached_property
+    def raster_in_map(self) -> Raster:
+        """The map from above, along the map's axes."""
+        return rasterise(self.still_blocks, None, CELL)
 
-    def section(self, kind: str) -> Slab:
-        """A slab of the map from its side, computed once for all files that show it. kind: section or profile."""
-        if kind not in self._sections:
-            self._sections[kind] = (
-                of_box(self.still_blocks, self.choice.box, self.where)
-                if kind == "section"
-                else of_path(self.still_blocks, self.trajectory.positions, self.choice.slab / 2, self.where)
-            )
-        return self._sections[kind]
+    @cached_property
+    def raster(self) -> Raster:
+        """The map from above, along the axes of the grid on Earth, if that is known."""
+        return self.raster_in_map if self.where is None else rasterise(self.still_blocks, self.where, CELL)
+
+    @cached_property
+    def coarse_raster(self) -> Raster:
+        """As `raster`, with larger cells."""
+        return rasterise(self.still_blocks, self.where, COARSE_CELL)
+
+    @cached_property
+    def section(self) -> Slab:
+        """The content of the box from its front."""
+        return of_box(self.still_blocks, self.choice.box, self.where)
+
+    @cached_property
+    def profile(self) -> Slab:
+        """The points along the walked path, from its side."""
+        return of_path(self.still_blocks, self.trajectory.positions, self.choice.slab / 2, self.where)
