@@ -217,7 +217,7 @@ def simulate(
     from app.sensors.simulator.imperfections import IMPERFECT, NONE
 
     imperfections = (IMPERFECT if imperfect else NONE).with_sizes(errors or [])
-    if (scene is not None) if suite is not None else short:
+    if (suite is None and short) or (suite is not None and scene is not None):
         raise HemislamError("SCENE takes --duration, --suite takes --short; give either SCENE or --suite.")
     if suite is not None:
         only = ("duration", "rate", "coordinate_step", "range_step", "scanner", "tables", "upright", "gnss", "force")

@@ -101,7 +101,7 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
         numbers = table.numbers(*columns)
     else:
         degrees = table.numbers(*columns)
-        every = Fixes.of(np.arange(len(degrees)), degrees).sound(table.source)
+        every = Fixes.of(np.arange(len(degrees)), degrees).sound(table.source)  # rows stand for times
         ground = Ground.of(every, grid)
         grid = ground.centre.crs
         numbers = np.full(degrees.shape, np.nan)
