@@ -176,7 +176,7 @@ def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False)
     Raises:
         HemislamError: Dask is not installed, or an option is there without the one it belongs to.
     """
-    from app.evaluation.cluster import Cluster
+    from app.evaluation.cluster import run_on_cluster
     from app.evaluation.runner import run_jobs
 
     if address is None:
@@ -185,7 +185,7 @@ def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False)
         return partial(run_jobs, parallel=parallel, quiet=quiet)
     if find_spec("distributed") is None:
         raise HemislamError("--cluster needs Dask; install it with `pip install 'hemislam[cluster]'`.")
-    return Cluster(address, url).run_jobs
+    return partial(run_on_cluster, address=address, url=url)
 
 
 def read_subjects(

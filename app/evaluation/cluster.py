@@ -17,7 +17,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,8 @@ TAKE_S = 20.0
 """How long a worker may take to hand over the files of a run. A dead worker never does."""
 PIECE = 16 << 20
 """Bytes of a recording that are sent at a time."""
+PATIENCE_S = 120.0
+"""How long to wait for the return of a scheduler or of workers that are gone."""
 MOST_DEATHS = 3
 """A job is given up after this many workers died while running it."""
 
@@ -49,114 +51,108 @@ class _Died(Exception):
     """A worker no longer answers."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cluster:
-    """Attributes:
-    address: of the scheduler, such as tcp://scheduler:8786.
-    url: folder of the recordings for workers that do not have their path, such as s3://bucket/walks; "" for none.
-    wait_s: how long to wait for the return of a scheduler or of workers that are gone.
+def run_on_cluster(jobs: list[Job], *, address: str, url: str = "") -> dict[tuple[str, str], str]:
+    """Run all jobs that are not finished yet, as `app.evaluation.runner.run_jobs` does.
+
+    Args:
+        address: of the scheduler, such as tcp://scheduler:8786.
+        url: folder of the recordings for workers that do not have their path, such as s3://bucket/walks; "" for none.
+
+    Raises:
+        HemislamError: the cluster is not there, a worker has another version of hemislam, or lacks a recording.
     """
+    errors: dict[tuple[str, str], str] = {}
+    waiting = {job.folder: job for job in jobs if finished(job) is None}
+    lost_s, told = -math.inf, ""  # when the cluster was lost, 0 while it is there; it must be there at the start
+    with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
+        while waiting:
+            try:
+                with _connected(address) as client:
+                    lost_s = 0.0
+                    for job, error in _results(client, list(waiting.values()), url):
+                        del waiting[job.folder]
+                        bar.update()
+                        if error:
+                            errors[job.name, job.variant] = error
+            except _Gone as gone:
+                lost_s = lost_s or time.monotonic()
+                if time.monotonic() - lost_s > PATIENCE_S:
+                    kept = " Finished runs are kept; the same command continues." if len(waiting) < len(jobs) else ""
+                    raise HemislamError(f"{gone}{kept}") from None
+                if str(gone) != told:
+                    told = str(gone)
+                    tqdm.write(f"{told} Waiting for it up to {PATIENCE_S:.0f} s …", file=sys.stderr)
+                time.sleep(LOOK_S)
+    return errors
 
-    address: str
-    url: str = ""
-    wait_s: float = 120.0
 
-    def run_jobs(self, jobs: list[Job]) -> dict[tuple[str, str], str]:
-        """Run all jobs that are not finished yet, as `app.evaluation.runner.run_jobs` does.
+def _results(client: Any, jobs: Sequence[Job], url: str) -> Iterator[tuple[Job, str]]:
+    """Yield jobs as they end, with the reason if they failed. Raises _Gone."""
+    waiting, running = deque(jobs), dict[str, tuple[Job, Any]]()
+    deaths, news = Counter[Path](), threading.Event()
+    while waiting or running:
+        there = _workers(client)
+        for worker in running.keys() - there.keys():
+            job, _ = running.pop(worker)
+            deaths[job.folder] += 1
+            if deaths[job.folder] == MOST_DEATHS:
+                yield job, f"{MOST_DEATHS} workers died while running it; they may have too little memory."
+            else:
+                waiting.appendleft(job)
+        for worker in sorted(there.keys() - running.keys())[: len(waiting)]:
+            with contextlib.suppress(_Died):
+                _check(client, worker, there[worker]["nthreads"])
+                if not url:
+                    _bring(client, worker, waiting[0])
+                job = waiting.popleft()
+                key = f"hemislam-{job.key}-{job.name}-{job.variant}-{deaths[job.folder]}"
+                future = client.submit(_work, job, url, key=key, workers=[worker])
+                future.add_done_callback(lambda _: news.set())
+                running[worker] = job, future
+        news.wait(LOOK_S)
+        news.clear()
+        for worker, (job, future) in list(running.items()):
+            if future.done() and (error := _taken(job, future)) is not None:
+                del running[worker]
+                yield job, error
 
-        Raises:
-            HemislamError: the cluster is not there, a worker has another version of hemislam, or lacks a recording.
-        """
-        errors: dict[tuple[str, str], str] = {}
-        waiting = {job.folder: job for job in jobs if finished(job) is None}
-        lost_s, told = -math.inf, ""  # when the cluster was lost, 0 while it is there; it must be there at the start
-        with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
-            while waiting:
-                try:
-                    with self._client() as client:
-                        lost_s = 0.0
-                        for job, error in self._results(client, list(waiting.values())):
-                            del waiting[job.folder]
-                            bar.update()
-                            if error:
-                                errors[job.name, job.variant] = error
-                except _Gone as gone:
-                    lost_s = lost_s or time.monotonic()
-                    if time.monotonic() - lost_s > self.wait_s:
-                        kept = (
-                            " Finished runs are kept; the same command continues." if len(waiting) < len(jobs) else ""
-                        )
-                        raise HemislamError(f"{gone}{kept}") from None
-                    if str(gone) != told:
-                        told = str(gone)
-                        tqdm.write(f"{told} Waiting for it up to {self.wait_s:.0f} s …", file=sys.stderr)
-                    time.sleep(LOOK_S)
-        return errors
 
-    def _results(self, client: Any, jobs: Sequence[Job]) -> Iterator[tuple[Job, str]]:
-        """Yield jobs as they end, with the reason if they failed. Raises _Gone."""
-        waiting, running = deque(jobs), dict[str, tuple[Job, Any]]()
-        deaths, news = Counter[Path](), threading.Event()
-        while waiting or running:
-            there = _workers(client)
-            for worker in running.keys() - there.keys():
-                job, _ = running.pop(worker)
-                deaths[job.folder] += 1
-                if deaths[job.folder] == MOST_DEATHS:
-                    yield job, f"{MOST_DEATHS} workers died while running it; they may have too little memory."
-                else:
-                    waiting.appendleft(job)
-            for worker in sorted(there.keys() - running.keys())[: len(waiting)]:
-                with contextlib.suppress(_Died):
-                    _check(client, worker, there[worker]["nthreads"])
-                    self._bring(client, worker, waiting[0])
-                    job = waiting.popleft()
-                    key = f"hemislam-{job.key}-{job.name}-{job.variant}-{deaths[job.folder]}"
-                    future = client.submit(_work, job, self.url, key=key, workers=[worker])
-                    future.add_done_callback(lambda _: news.set())
-                    running[worker] = job, future
-            news.wait(LOOK_S)
-            news.clear()
-            for worker, (job, future) in list(running.items()):
-                if future.done() and (error := _taken(job, future)) is not None:
-                    del running[worker]
-                    yield job, error
+@contextlib.contextmanager
+def _connected(address: str) -> Iterator[Any]:
+    """A connected client with at least one worker. Raises _Gone: the scheduler or all workers are not there."""
+    from distributed import Client
+    from distributed.comm import CommClosedError
 
-    @contextlib.contextmanager
-    def _client(self) -> Iterator[Any]:
-        """A connected client with at least one worker. Raises _Gone: the scheduler or all workers are not there."""
-        from distributed import Client
-        from distributed.comm import CommClosedError
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported here in a sentence instead
+    gone = f"There is no Dask scheduler at {address}; start one with `dask scheduler`."
+    try:
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError):
+        raise _Gone(gone) from None
+    try:
+        with contextlib.suppress(TimeoutError):
+            client.wait_for_workers(1, timeout=CONNECT_S)
+        _workers(client)
+        yield client
+    except (CommClosedError, TimeoutError):
+        raise _Gone(gone) from None
+    finally:
+        client.close(timeout=5)
 
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported here in a sentence instead
-        gone = f"There is no Dask scheduler at {self.address}; start one with `dask scheduler`."
-        try:
-            client = Client(self.address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError):
-            raise _Gone(gone) from None
-        try:
-            with contextlib.suppress(TimeoutError):
-                client.wait_for_workers(1, timeout=CONNECT_S)
-            _workers(client)
-            yield client
-        except (CommClosedError, TimeoutError):
-            raise _Gone(gone) from None
-        finally:
-            client.close(timeout=5)
 
-    def _bring(self, client: Any, worker: str, job: Job) -> None:
-        """Copy a job's recording piece by piece to a worker that has no other access to it. Raises _Died."""
-        if self.url or _ask(client, worker, _here, job):
-            return
-        if job.recording.is_dir():
-            raise HemislamError(
-                f"Worker {worker} cannot read {job.recording}, and folders are not copied; make it readable there."
-            )
-        with job.recording.open("rb") as file:
-            while piece := file.read(PIECE):
-                if problem := _ask(client, worker, _append, job, file.tell() - len(piece), piece):
-                    raise HemislamError(f"Worker {worker} cannot keep a copy of {job.recording}: {problem}.")
-        _ask(client, worker, _settle, job)
+def _bring(client: Any, worker: str, job: Job) -> None:
+    """Copy a job's recording piece by piece to a worker that has no other access to it. Raises _Died."""
+    if _ask(client, worker, _here, job):
+        return
+    if job.recording.is_dir():
+        raise HemislamError(
+            f"Worker {worker} cannot read {job.recording}, and folders are not copied; make it readable there."
+        )
+    with job.recording.open("rb") as file:
+        while piece := file.read(PIECE):
+            if problem := _ask(client, worker, _append, job, file.tell() - len(piece), piece):
+                raise HemislamError(f"Worker {worker} cannot keep a copy of {job.recording}: {problem}.")
+    _ask(client, worker, _settle, job)
 
 
 def _ask(client: Any, worker: str, function: Callable[..., Any], *about: Any) -> Any:

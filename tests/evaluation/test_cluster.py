@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from app.__main__ import cli
 from app.evaluation import cluster
-from app.evaluation.cluster import Cluster
+from app.evaluation.cluster import run_on_cluster
 from app.evaluation.job import Job, finished
 from app.sensors.presets import resolve_params
 from app.slam.errors import HemislamError
@@ -120,18 +120,18 @@ def test_a_worker_without_the_recording_is_sent_it(
     """And a column that repeats another one is run, too."""
     away = tmp_path / "walk.mcap"
     away.write_bytes(recording.read_bytes())
-    bring = Cluster._bring
+    bring = cluster._bring
 
-    def bring_once(self: Cluster, client: Any, worker: str, job: Job) -> None:
+    def bring_once(client: Any, worker: str, job: Job) -> None:
         if away.exists():  # all workers are on this machine, and have one copy
-            bring(self, client, worker, job)
+            bring(client, worker, job)
             away.unlink()
 
-    monkeypatch.setattr(Cluster, "_bring", bring_once)
+    monkeypatch.setattr(cluster, "_bring", bring_once)
     monkeypatch.setattr(cluster, "_here", lambda job: None)
     monkeypatch.setattr(cluster, "PIECE", 100_000)
     jobs = [job_of(away, tmp_path / name) for name in ("first", "again")]
-    assert Cluster(site.address).run_jobs(jobs) == {}
+    assert run_on_cluster(jobs, address=site.address) == {}
     assert [finished(job) is not None for job in jobs] == [True, True]
 
 
@@ -161,7 +161,7 @@ def test_a_recording_that_cannot_be_used_costs_its_own_run_only(site: Site, reco
     empty = tmp_path / "empty.mcap"
     empty.write_bytes(b"")
     good, bad = job_of(recording, tmp_path / "good"), job_of(empty, tmp_path / "bad")
-    errors = Cluster(site.address).run_jobs([good, bad])
+    errors = run_on_cluster([good, bad], address=site.address)
     assert finished(good) is not None
     assert list(errors) == [("walk", "bad")] and "empty.mcap" in errors["walk", "bad"]
 
@@ -175,6 +175,6 @@ def test_no_scheduler_and_other_versions_are_reported_in_a_sentence(
     monkeypatch.setattr(cluster, "CONNECT_S", 15.0)
     monkeypatch.setattr(cluster, "__version__", "99.0")
     with pytest.raises(HemislamError, match=r"has version .*, and this is 99.0"):
-        Cluster(site.address).run_jobs([job_of(recording, tmp_path / "run")])
+        run_on_cluster([job_of(recording, tmp_path / "run")], address=site.address)
     result = evaluate(recording, tmp_path / "data", "--cluster-data", "s3://bucket")
     assert result.exit_code == 2 and "belongs to --cluster" in result.output
