@@ -4,7 +4,7 @@ import contextlib
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,7 +24,6 @@ from app.cli.options import (
 from app.slam.errors import HemislamError, quoted
 
 if TYPE_CHECKING:
-    from app.calibration.calibrate import Calibration
     from app.mapping.session import Session
     from app.slam.params import Params
 
@@ -115,31 +114,31 @@ def settle_mounting(recording: Path, params: "Params") -> tuple["Params", str]:
 
     if not is_mounting_unknown(params):
         return params, ""
-    found = _contradicted(recording, params, "Estimating the pose of the LiDAR on the IMU")
-    if isinstance(found, str):
-        return params, found
-    advised = f"{found.contradiction()}; `run` and `serve` use this. To save it: {_saving(recording)}"
-    return params.with_values(found.found()), advised
+    values, why = _contradicting(recording, params, "Estimating the pose of the LiDAR on the IMU")
+    if values is None:
+        return params, why
+    return params.with_values(values), f"{why}; `run` and `serve` use this. To save it: {_saving(recording)}"
 
 
 def look_for_mounting(recording: Path, params: "Params") -> str:
     """A sentence if the recording shows another mounting than the parameters; otherwise ""."""
-    found = _contradicted(recording, params, "Looking for the cause")
-    return found if isinstance(found, str) else f"{found.contradiction()}: {_saving(recording)}"
+    values, why = _contradicting(recording, params, "Looking for the cause")
+    return why if values is None else f"{why}: {_saving(recording)}"
 
 
-def _contradicted(recording: Path, params: "Params", why: str) -> "Calibration | str":
-    """The calibration, if mounting or clock differ from the parameters; else why there is none, "" if unknown."""
+def _contradicting(recording: Path, params: "Params", title: str) -> tuple[dict[str, Any] | None, str]:
+    """Values found in the recording that contradict the parameters, and a sentence on them; else None, and why."""
     from app.calibration.calibrate import MirroredError, calibrate
 
-    with progress_bar(why) as show:
+    with progress_bar(title) as show:
         try:
             found = calibrate(recording, params, UNASKED_S, show)
         except MirroredError as error:
-            return str(error)
+            return None, str(error)
         except HemislamError:  # such as too short a recording; opening it reports what is wrong with it
-            return ""
-    return found if found.contradiction() else ""
+            return None, ""
+    contradiction = found.contradiction()
+    return found.found() if contradiction else None, contradiction
 
 
 def _saving(recording: Path) -> str:
