@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from app.evaluation.job import Job
 from app.evaluation.measured import Evaluated, Outcome, load, measure
 from app.evaluation.report import write_report
@@ -19,7 +17,6 @@ from app.slam.params import Params
 from app.slam.provenance import sha256_of
 from app.slam.text_files import make_folder
 from app.slam.trajectory import Trajectory
-from app.slam.types import F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,29 +99,8 @@ def evaluate(
             for variant in variants
         ]
         outcomes += [Outcome(name, "a trajectory from elsewhere", trajectory=other) for name, other in subject.compared]
-        evaluated.append(_measured(subject, hashes[subject.name], outcomes))
+        outcomes, notes, truth_path = measure(outcomes, subject.truth)
+        truth = subject.truth.description if subject.truth else ""
+        sha256 = hashes[subject.name]
+        evaluated.append(Evaluated(subject.name, subject.recording, sha256, tuple(outcomes), truth, notes, truth_path))
     return write_report(folder, evaluated), failures
-
-
-def _measured(subject: Subject, sha256: str, outcomes: list[Outcome]) -> Evaluated:
-    truth, described = subject.truth, ""
-    outcomes, matched, problem = measure(outcomes, truth)
-    if truth is not None:  # the notes say whether a lever arm was removed
-        point = "" if any(truth.lever) else " of a point taken as the IMU's own (no lever arm)"
-        described = f"{truth.source}: {truth.kind}, {len(truth)} poses{point}."
-    return Evaluated(
-        name=subject.name,
-        recording=subject.recording,
-        sha256=sha256,
-        outcomes=tuple(outcomes),
-        truth=described,
-        notes=() if truth is None else (matched.notes if matched else (problem,)),
-        truth_path=_path(matched.trajectory, outcomes) if matched else None,
-    )
-
-
-def _path(truth: Trajectory, outcomes: Sequence[Outcome]) -> F64:
-    """(n, 3) m, the truth over the compared time."""
-    stamps = np.concatenate([o.trajectory.stamps_ns for o in outcomes if o.accuracy and o.trajectory is not None])
-    inside = (truth.stamps_ns >= stamps.min()) & (truth.stamps_ns <= stamps.max())
-    return np.asarray(truth.positions[inside])

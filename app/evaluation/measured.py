@@ -16,7 +16,7 @@ from app.slam.errors import HemislamError
 from app.slam.metrics import GroundScore, ate, compare, drift, paired, walked_m
 from app.slam.report import spread
 from app.slam.trajectory import Trajectory, read_tum
-from app.slam.types import F64, TIMINGS, U16
+from app.slam.types import F64, I64, TIMINGS, U16
 
 START_S = 5.0
 """Duration of the start: rest and first steps. A slip there moves all later poses against the few of the start."""
@@ -171,23 +171,32 @@ def _trajectory(path: Path) -> Trajectory | None:
         return None
 
 
-def measure(outcomes: list[Outcome], truth: TruePoses | None) -> tuple[list[Outcome], Matched | None, str]:
-    """The outcomes with their errors; the truth as matched to the first outcome; why none could be matched."""
-    if truth is None:
-        return outcomes, None, ""
+def measure(outcomes: list[Outcome], truth: TruePoses | None) -> tuple[list[Outcome], tuple[str, ...], F64 | None]:
+    """The outcomes with their errors, notes on the truth, and (n, 3) m, the true path over the compared time.
+
+    Notes and path are those of the first outcome that matches. If none does, the note says why, and there is no path.
+    """
     first: Matched | None = None
-    problem, measured = "", []
+    problems, measured, stamps = list[str](), list[Outcome](), list[I64]()
     for outcome in outcomes:
-        if outcome.trajectory is not None:
+        if truth is not None and (estimate := outcome.trajectory) is not None:
             try:
-                matched = match(truth, outcome.trajectory, first.offset_s if first else None)
-                outcome = replace(outcome, accuracy=_accuracy(outcome.trajectory, matched))
+                matched = match(truth, estimate, first.offset_s if first else None)
+                outcome = replace(outcome, accuracy=_accuracy(estimate, matched))
                 first = first or matched
+                stamps.append(estimate.stamps_ns)
             except HemislamError as error:
-                problem = problem or str(error)
+                problems.append(str(error))
                 outcome = replace(outcome, unmeasured=str(error))
         measured.append(outcome)
-    return measured, first, "" if first else problem
+    if first is None:
+        return measured, tuple(problems[:1]), None
+    path, compared = first.trajectory, np.concatenate(stamps)
+    return (
+        measured,
+        first.notes,
+        path.positions[(path.stamps_ns >= compared.min()) & (path.stamps_ns <= compared.max())],
+    )
 
 
 def _accuracy(estimate: Trajectory, matched: Matched) -> Accuracy:

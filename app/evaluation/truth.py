@@ -58,6 +58,12 @@ class TruePoses:
     def __len__(self) -> int:
         return len(self.positions)
 
+    @property
+    def description(self) -> str:
+        """In a sentence; whether a lever arm was removed, the notes of `match` say."""
+        point = "" if any(self.lever) else " of a point taken as the IMU's own (no lever arm)"
+        return f"{self.source}: {self.kind}, {len(self)} poses{point}."
+
 
 def check(truth: TruePoses) -> None:
     """Raises HemislamError if it is too short, not finite, out of order, or jumps."""

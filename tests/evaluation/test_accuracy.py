@@ -41,8 +41,8 @@ def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
 def check_against_evo(estimate: Trajectory, truth: Trajectory) -> bool:
     """Whether there is a rotation error after the alignment."""
     given_truth = TruePoses("The truth", "TUM", truth.stamps_ns, truth.positions, truth.quaternions)
-    columns, _, problem = measure([Outcome("ours", trajectory=estimate)], given_truth)
-    assert problem == "" and columns[0].accuracy is not None
+    columns, _, path = measure([Outcome("ours", trajectory=estimate)], given_truth)
+    assert path is not None and columns[0].unmeasured == "" and columns[0].accuracy is not None
     errors = columns[0].accuracy.errors
     aligned = as_evo(estimate)
     aligned.align(as_evo(truth), correct_scale=False)
