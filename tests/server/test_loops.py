@@ -191,9 +191,11 @@ def test_the_loops_process_killed_twice_is_revived_and_leaves_the_same_files(
     assert walk.saved(tmp_path) == files
 
 
-def test_edits_do_not_pass_to_the_loops_of_other_keyframes() -> None:
-    """Keyframes are numbered in their order, so with other settings the same numbers are other places."""
-    walk = Walk()
+def test_edits_do_not_pass_to_the_loops_of_other_keyframes(walk: Walk) -> None:
+    """Keyframes are numbered in their order, so with other settings the same numbers are other places.
+
+    The last test, since it leaves the walk with other keyframes.
+    """
     rejected = [EditLoop(Reject(*edge.pair)) for edge in accepted(walk.end())]
     assert walk.do(*rejected, SetParams({"keyframe.distance": 1.0})).loops.undo, "for keyframes to come only"
     after = walk.do(Restart())
@@ -202,4 +204,3 @@ def test_edits_do_not_pass_to_the_loops_of_other_keyframes() -> None:
     assert edited.loops.undo and walk.do(Restart()).loops.undo, "the same keyframes come again"
     went_on = walk.do(Seek(5), SetParams({"keyframe.distance": 0.5}))
     assert not went_on.loops.undo
-    walk.controller.close()
