@@ -62,6 +62,14 @@ AT_TEN_FRAMES_A_SECOND = """(() => {
   window.cancelAnimationFrame = (id) => pending.delete(id);
 })()"""
 """Limits the page's drawing. Software rendering without a limit would take a whole core from the tests."""
+COARSE = """(() => {
+  const getContext = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = function (kind, asked) {
+    return getContext.call(this, kind, kind.startsWith("webgl") ? {...asked, antialias: false} : asked);
+  };
+  Object.defineProperty(window, "devicePixelRatio", {get: () => 0.5});
+})()"""
+"""Draws the scene in pixels of twice the size and without antialiasing: fewer pixels for software rendering."""
 SLIDERS = "[role=slider][aria-valuenow]"
 """The sliders of parameters; those of the legend's colour bar are inputs of the browser's own."""
 ALPHA = 1
@@ -164,6 +172,7 @@ def new_page(chromium: Browser, width: int, height: int, *, tour: bool = False) 
     page = chromium.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(SLOW_MS)
     page.add_init_script(AT_TEN_FRAMES_A_SECOND)
+    page.add_init_script(COARSE)
     if not tour:
         page.add_init_script("localStorage.setItem('hemislam-tour', 'seen')")
     page.on("pageerror", lambda error: complaints.append(str(error)))
