@@ -22,6 +22,7 @@ from app.slam.frames import READOUTS, Frame
 from app.slam.params import Params
 from app.slam.run_log import RunInfo, RunLog
 from app.slam.types import Cloud, Keyframe
+from tests.browser.conftest import AT_TEN_FRAMES_A_SECOND
 
 
 def plaza(points: int) -> Results:
@@ -40,6 +41,7 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
     file = tmp_path / "share.html"
     share.write(file, plaza(200_000))
     page, said = chromium.new_page(viewport={"width": 800, "height": 600}), list[str]()
+    page.add_init_script(AT_TEN_FRAMES_A_SECOND)
     page.on("console", lambda one: said.append(one.text) if one.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: said.append(str(error)))
     begin = time.monotonic()
@@ -50,6 +52,7 @@ def test_a_shared_page_opens_from_the_disk_without_a_complaint(chromium: Browser
         if (np.ptp(picture[100:500, 200:600], axis=2) > 40).mean() > 0.2:
             break
         assert time.monotonic() < deadline, "the map does not show"
+        page.wait_for_timeout(200)
     print(f"shown after {time.monotonic() - begin:.1f} s")
     if "SHARE_PICTURE" in os.environ:
         page.screenshot(path=Path(os.environ["SHARE_PICTURE"]))
