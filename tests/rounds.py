@@ -15,5 +15,5 @@ def walk_round(path: Path, *, perfect: bool = False) -> Path:
     """Write a brisk walk round a room, of a sensor with or without errors. Returns the path."""
     seed, errors = (0, NONE) if perfect else (3, IMPERFECT)
     brisk = Walker(speed=1.8, still=1.5)
-    simulate("room", path, duration_s=ROUND_S, seed=seed, every_block=10, walker=brisk, imperfections=errors)
+    simulate("room", path, duration_s=ROUND_S, seed=seed, every_block=16, walker=brisk, imperfections=errors)
     return path
