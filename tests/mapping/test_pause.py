@@ -26,7 +26,7 @@ AT, LASTED_S = 70, 20
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("walk") / "museum.mcap"
-    simulate("museum", path, duration_s=16.0, seed=3, every_block=8, imperfections=IMPERFECT)
+    simulate("museum", path, duration_s=16.0, seed=3, every_block=12, imperfections=IMPERFECT)
     return path
 
 
