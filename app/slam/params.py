@@ -168,7 +168,7 @@ class Leaf:
     @property
     def help(self) -> str:
         """Meaning, unit, range and when it takes effect, in one line."""
-        facts = [f"unit {self.unit}" if self.unit else "", self.range, f"acts {WHEN[self.effect]}"]
+        facts = [f"unit {self.unit}" if self.unit else "", self.range, f"applies {WHEN[self.effect]}"]
         return f"{self.meaning} [{'; '.join(fact for fact in facts if fact)}]"
 
 

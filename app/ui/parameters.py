@@ -246,7 +246,7 @@ class ParameterPanel:
                 for leaf in self._sections[section].values():
                     self._add(leaf)
                 self._add_reset(section)
-        gui.add_html(panel("quiet", "▸ acts from the next frame · ↻ acts on restart"))
+        gui.add_html(panel("quiet", "▸ applies from the next frame · ↻ applies on restart"))
 
     def follow(self, a: Snapshot) -> None:
         """Note the values with which A's recording was opened; `reset` restores them, also in a fork."""

@@ -171,7 +171,7 @@ def test_the_comments_tell_meaning_unit_range_and_effect() -> None:
     text = Params().to_yaml()
     for leaf in LEAVES:
         assert f"# {leaf.help}" in text
-    assert "[unit deg; 1 to 90; acts at once]" in text
+    assert "[unit deg; 1 to 90; applies at once]" in text
 
 
 def test_the_documentation_shows_every_parameter_in_the_table_of_its_section() -> None:
