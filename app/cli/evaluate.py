@@ -66,10 +66,10 @@ def evaluate(
     ] = None,
     out: Out = Path("runs/evaluation"),
     truths: Truths = None,
-    lever: Annotated[
-        str | None,
+    lever_arm: Annotated[
+        tuple[float, float, float] | None,
         typer.Option(
-            "--lever", metavar="X,Y,Z", help="Metres from the IMU to the point of the truth, in the axes of its body."
+            "--lever-arm", metavar="X Y Z", help="Metres from the IMU to the point of the truth, in its body's axes."
         ),
     ] = None,
     variants: Annotated[
@@ -145,9 +145,9 @@ def evaluate(
         )
     if not paths:
         raise HemislamError("Nothing to evaluate; name a RECORDING or use --suite paper.")
-    subjects = read_subjects(paths, params_for, truths or [], _lever(lever))
-    if lever is not None and all(subject.truth is None for subject in subjects):
-        raise HemislamError("--lever belongs to a truth, and no recording has one; add --truth, or leave it out.")
+    subjects = read_subjects(paths, params_for, truths or [], lever_arm)
+    if lever_arm is not None and all(subject.truth is None for subject in subjects):
+        raise HemislamError("--lever-arm belongs to a truth, and no recording has one; add --truth, or leave it out.")
     others = _compared(compare or [], [subject.name for subject in subjects], [variant.name for variant in chosen])
     subjects = [replace(subject, compared=tuple(others[subject.name])) for subject in subjects]
     for variant in chosen:
@@ -218,16 +218,6 @@ def read_subjects(
             Subject(name, path, params, read_truth(text, path, lever) if text not in ("", "none") else None)
         )
     return subjects
-
-
-def _lever(text: str | None) -> "Vector | None":
-    if text is None:
-        return None
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise HemislamError(f"`--lever {text}` is not three numbers; write it as --lever 0.1,0,-0.2.") from None
-    return x, y, z
 
 
 def _compared(texts: list[str], names: list[str], variants: list[str]) -> dict[str, list[tuple[str, "Trajectory"]]]:

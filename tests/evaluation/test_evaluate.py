@@ -202,8 +202,8 @@ def test_two_variants_of_one_name_and_misspelt_parameters_are_refused() -> None:
     [
         ([], "Nothing to evaluate"),
         (["--suite", "papre"], "no suite `papre`"),
-        (["RECORDING", "--lever", "1,2"], "not three numbers"),
-        (["RECORDING", "--lever", "1,2,3", "--truth", "none"], "--lever belongs to a truth"),
+        (["RECORDING", "--lever-arm", "1", "2"], "requires 3 arguments"),
+        (["RECORDING", "--lever-arm", "1", "2", "3", "--truth", "none"], "--lever-arm belongs to a truth"),
         (["RECORDING", "--compare", "theirs.tum"], "NAME=FILE"),
         (["RECORDING", "--compare", "Ours=theirs.tum"], "a column Ours exists already"),
         (["RECORDING", "--short"], "--duration shortens it"),
