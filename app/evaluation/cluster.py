@@ -63,20 +63,20 @@ def run_on_cluster(jobs: list[Job], *, address: str, url: str = "") -> dict[tupl
     """
     errors: dict[tuple[str, str], str] = {}
     waiting = {job.folder: job for job in jobs if finished(job) is None}
-    lost_s, told = -math.inf, ""  # when the cluster was lost, 0 while it is there; it must be there at the start
+    patient_until, told = -math.inf, ""  # at the start, the cluster must be there
     with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
         while waiting:
             try:
                 with _connected(address) as client:
-                    lost_s = 0.0
+                    patient_until = math.inf
                     for job, error in _results(client, list(waiting.values()), url):
                         del waiting[job.folder]
                         bar.update()
                         if error:
                             errors[job.name, job.variant] = error
             except _Gone as gone:
-                lost_s = lost_s or time.monotonic()
-                if time.monotonic() - lost_s > PATIENCE_S:
+                patient_until = min(patient_until, time.monotonic() + PATIENCE_S)
+                if time.monotonic() > patient_until:
                     kept = " Finished runs are kept; the same command continues." if len(waiting) < len(jobs) else ""
                     raise HemislamError(f"{gone}{kept}") from None
                 if str(gone) != told:

@@ -24,19 +24,10 @@ from tests.ui.conftest import icons_read_once  # noqa: F401 - a fixture
 from tests.ui.fake_engine import FakeEngine
 from tests.ui.fake_forks import alone
 
-NOT_NEEDED = (
-    "WebUIOmniboxPopup", "WebUIOmniboxAimPopup", "WebUIOmniboxFullPopup",
-    # those that playwright names, since only the last list counts
-    "AimEnabled", "AvoidUnnecessaryBeforeUnloadCheckSync", "DestroyProfileOnBrowserClose", "HttpsUpgrades",
-    "HttpsFirstBalancedModeAutoEnable", "LensOverlay", "MediaRouter", "NetworkTimeServiceQuerying", "OptimizationHints",
-    "PaintHolding", "PreconnectToSearch", "ThirdPartyStoragePartitioning",
-)  # fmt: skip
-"""Parts of Chromium. The address bar, which is never seen, is two pages of its own for each of ours."""
 ARGS = (
     "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--disable-gpu-compositing",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
-    "--disable-features=" + ",".join(NOT_NEEDED),
 )  # fmt: skip
 SLOW_MS = 120_000
 """Software rendering on a busy machine; what is expected comes as soon as it comes."""
