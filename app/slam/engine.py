@@ -20,6 +20,7 @@ from app.slam.params import Params
 from app.slam.pause import Interruption
 from app.slam.prediction import Prediction, predict
 from app.slam.sections import SensorParams
+from app.slam.start import Ride
 from app.slam.types import (
     F32,
     F64,
@@ -48,7 +49,7 @@ class EngineProgress:
         lines, gyro, clock: estimated errors of the scan lines, of the gyroscope and of the IMU's clock.
         paused: the pause after which there is no keyframe yet; None if there is none.
         doubt: how far odometry may be off since the last keyframe.
-        ride: while the start waits for a rest, the belief by scans in case the device rides evenly instead; else None.
+        ride: while the start waits for a rest, what scans show in case the device rides evenly instead; else None.
         bent: whether the map holds only one scan, deskewed at an unknown speed (`app.slam.fusion`).
     """
 
@@ -64,7 +65,7 @@ class EngineProgress:
     gyro: GyroErrors = field(default_factory=GyroErrors)
     paused: Interruption | None = None
     doubt: Doubt = field(default_factory=Doubt)
-    ride: Belief | None = None
+    ride: Ride | None = None
     bent: bool = False
 
 
@@ -85,7 +86,7 @@ class _Begun:
     Attributes:
         belief: before the scan; while waiting, at its end. samples: those that lead from there to the scan's end.
         still: as in `start.Started`. floor, paused: as in `EngineProgress`. notice: for the user; "" if none.
-        ride: before the scan, as in `EngineProgress`; None unless a longer rest is awaited.
+        ride: before the scan, in case the device rides evenly; None unless a longer rest is awaited.
     """
 
     belief: Belief
@@ -223,7 +224,7 @@ class Engine:
             gyro=gyro,
             paused=paused if settling else None,
             doubt=doubt if keyframe is None else replace(doubt, metres=0.0),
-            ride=mapped.belief if begun.waiting else None,
+            ride=Ride(mapped.belief, mapped.residual) if begun.waiting else None,
             bent=mapped.bent,
         )
         return result
@@ -278,10 +279,11 @@ class Engine:
             return _Begun(coast.begin(scan, p), samples, before.floor, notice=notice)
         started, ride = start.proceed(before.still, scan, samples, p), before.ride
         if started.waiting and imu.longest_gap(samples, end_ns) <= p.imu.max_gap:
-            ride = ride or start.moving(started.still, max(scan.stamp_ns, int(started.still.stamps_ns[0])), p)
-            return _Begun(started.belief, samples, before.floor, still=started.still, ride=ride)
+            begin_ns = max(scan.stamp_ns, int(started.still.stamps_ns[0]))
+            by_scans = start.moving(started.still, begin_ns, p) if ride is None else ride.belief
+            return _Begun(started.belief, samples, before.floor, still=started.still, ride=by_scans)
         if ride is not None and start.has_ridden(ride, started.belief):
-            return _Begun(ride, samples, before.floor, notice=start.RIDING)
+            return _Begun(ride.belief, samples, before.floor, notice=start.RIDING)
         self._map.clear()  # drop what was mapped while waiting for a rest
         return _Begun(started.belief, samples, before.floor, notice=started.notice)
 
@@ -313,9 +315,9 @@ class Engine:
         return lines.learnt(belief, points, rings, walked, self._map, self.params.filter)
 
     def _insert(self, belief: Belief, fused: Fused) -> None:
-        points, residual = fused.sampled, float(np.nan_to_num(fused.registration.residual_rms))
+        points = fused.sampled
         T = belief.state.T_odom_lidar.astype(np.float32)
-        self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, residual)
+        self._map.insert(points @ T[:3, :3].T + T[:3, 3], T[:3, 3].astype(np.float64), self.params.map, fused.residual)
 
     def _keyframe(
         self, belief: Belief, cloud: Cloud, certainty: Certainty, paused: Interruption | None, astray: float

@@ -57,6 +57,11 @@ class Fused:
     bent: bool = False
     anew: bool = False
 
+    @property
+    def residual(self) -> float:
+        """m, RMS distance of the points from the map; 0 if they met too few planes."""
+        return float(np.nan_to_num(self.registration.residual_rms))
+
 
 def fuse(
     prediction: Prediction,
