@@ -28,8 +28,12 @@ PRESETS: dict[str, dict[str, Any]] = {
     "airy": {
         "recording": {"lidar_topic": "/rslidar_points", "imu_topic": "/rslidar_imu_data"},
         "sensor": {"translation": [0.0, 0.0, 0.0], "rotation": [180.0, 0.0, -90.0]},
+        "ground": {"scan_lines": 24},
     },
-    "jt128": {"recording": {"lidar_topic": "/lidar_points", "imu_topic": "/lidar_imu"}},
+    "jt128": {
+        "recording": {"lidar_topic": "/lidar_points", "imu_topic": "/lidar_imu"},
+        "ground": {"scan_lines": 32},
+    },
     "ouster": {
         "recording": {"lidar_topic": "/ouster/points", "imu_topic": "/ouster/imu"},
         "sensor": {"translation": [-0.006253, 0.011775, 0.028535], "rotation": [0.0, 0.0, 180.0]},
@@ -42,10 +46,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 their pose of the LiDAR on the IMU, for recordings under other topics. `mid360`: Livox's ROS drivers, with the IMU
 inside the Mid-360 at the place that its manual states. `airy`: RoboSense's ROS driver and the IMU inside, whose axes
 are those of the vendor's examples; each unit states its own pose in DIFOP packets. `jt128`: Hesai's ROS driver; the
-axes agree. `ouster`: Ouster's ROS driver with clouds in `os_lidar`, the IMU's place from one unit's
-metadata; the doctor shows that of a capture's unit. `hesai-xt`,
-`velodyne`: their ROS drivers; the IMU is your own. `close`: most things are at arm's length (a desk, a cabin,
-a shaft)."""
+axes agree. `ouster`: Ouster's ROS driver with clouds in `os_lidar`, the IMU's place from one unit's metadata; the doctor
+shows that of a capture's unit. `hesai-xt`, `velodyne`: their ROS drivers; the IMU is your own. `close`: most things are
+at arm's length (a desk, a cabin, a shaft).
+
+`airy` and `jt128` search a quarter of all lines for ground seeds, as the defaults do for the 32 lines of an RS-Bpearl.
+Fewer of such dense lines lie so close together that the lines' own errors tilt the plane."""
 
 
 class _Appearance(NamedTuple):
