@@ -79,10 +79,11 @@ class MeasurePanel:
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Handle the newest click, and show the session's measures."""
-        if current.session != self._session:  # the spots belong to another session
-            self._session, self.spots = current.session, ()
-        click, self._click = self._click, None
         poses = current.keyframe_poses
+        frames = {chunk.index: chunk.frame for chunk in current.chunks} if current.measures or self.spots else {}
+        if current.session != self._session or places(Measure("", self.spots), poses, frames) is None:
+            self._session, self.spots = current.session, ()  # the spots lie on what is not in the map now
+        click, self._click = self._click, None
         tool = self._kind, self.taker
         if click is not None and self.picking and view.map:
             spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, moving=view.moving, clip=view.clip)
@@ -91,7 +92,6 @@ class MeasurePanel:
             if spot is not None and tool == (self._kind, self.taker):  # meanwhile the user may have chosen another
                 self._take(self._kind, spot, current)
         begun = self.spots if self.taker is None else ()
-        frames = {chunk.index: chunk.frame for chunk in current.chunks} if current.measures or begun else {}
         kept = [(measure, places(measure, poses, frames)) for measure in current.measures]
         where = [(measure, at) for measure, at in kept if at is not None]
         drawn = str([at.round(3).tolist() for _, at in where])

@@ -281,6 +281,20 @@ def test_a_cut_that_is_begun_is_not_ended_in_another_recording(server: viser.Vis
     assert bench.now.clip.box is None and bench.measure.picking
 
 
+def test_a_cut_whose_first_end_is_gone_after_going_back_begins_anew(server: viser.ViserServer) -> None:
+    bench = Bench(server)
+    bench.measure.draw(bench.now, View())
+    bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
+    bench.measure._take(bench.measure._kind, Spot(2, (0.0, 0.0, 0.0)), bench.now)
+    bench.now = replace(bench.now, chunks=bench.chunks[:2], keyframe_poses=bench.poses[:2])
+    bench.measure.draw(bench.now, View())
+    bench.draw()
+    assert "first end" in bench.panel._asked.content
+    for keyframe in (0, 1):
+        bench.measure._take(bench.measure._kind, Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
+    assert bench.now.clip.box is not None
+
+
 def test_a_box_that_is_hidden_while_it_is_dragged_has_its_handles_again_later(
     server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
