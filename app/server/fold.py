@@ -67,6 +67,7 @@ class Fold:
             keyframe_poses=poses,
             trajectory=self._positions.view()[:shown],
             series=series,
+            known_ns=self._frames.view()["stamp_ns"],
             T_map_truth=T_map_truth,
         )
         return self.snapshot

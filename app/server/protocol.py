@@ -316,7 +316,7 @@ class Snapshot(Kept):
         chunks: of all keyframes up to the frame. keyframe_poses: (k, 4, 4) T_map_imu.
         trajectory: (n, 3) m, positions of the IMU in the map. corrections: of odometry, by loops and by
             `adjustment`, which levels or georeferences the map.
-        series: (n,) arrays by SERIES name.
+        series: (n,) arrays by SERIES name. known_ns: (m,) stamps of all frames, also of those after the shown one.
         T_map_truth: (4, 4), aligns the truth with the trajectory; None until the trajectory determines it.
         notices: the newest 50. saved: the newest 10.
         live: state of the live source; None for a recording.
@@ -338,6 +338,7 @@ class Snapshot(Kept):
     adjustment: MapFrame = field(default_factory=MapFrame)
     loops: LoopsView = LoopsView()
     series: dict[str, F64] = field(default_factory=lambda: _NO_SERIES)
+    known_ns: I64 = field(default_factory=lambda: np.empty(0, np.int64))
     T_map_truth: F64 | None = None
     breakpoints: Breakpoints = field(default_factory=Breakpoints)
     progress: Progress | None = None

@@ -11,6 +11,7 @@ from app.mapping.painted import SUFFIX, UNMARKED, Stroke, marks, read_json, to_j
 from app.server.keeping import Paint, UndoPaint
 from app.server.protocol import Seek, Snapshot
 from app.slam import lie
+from app.slam.errors import HemislamError
 from app.slam.types import GROUND, NON_GROUND, U8, StepResult
 from app.ui.colours import LABEL_COLOURS
 from app.ui.html import panel
@@ -135,12 +136,10 @@ class BrushPanel:
     # --- the frames that have marks --------------------------------------------------------------
     def _go(self, word: str, _: viser.ClientHandle) -> None:
         """Handle what the list sends: "frame 1700000000000000000", with the frame's stamp."""
-        snapshot = self._page.snapshot()
-        if snapshot.recording is not None:
-            seconds = (int(word.removeprefix("frame ")) - snapshot.recording.start_ns) * 1e-9
-            frames = np.flatnonzero(np.abs(snapshot.series["stamp_s"] - seconds) < 1e-3)
-            if len(frames):
-                self._page.send(Seek(int(frames[0])))
+        frames = np.flatnonzero(self._page.snapshot().known_ns == int(word.removeprefix("frame ")))
+        if not len(frames):
+            raise HemislamError("This frame is not in the trajectory yet; play up to its time.")
+        self._page.send(Seek(int(frames[0])))
 
     def _download(self, client: viser.ClientHandle) -> None:
         snapshot = self._page.snapshot()

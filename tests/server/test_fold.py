@@ -172,6 +172,16 @@ def test_the_error_to_the_truth_follows_from_the_trajectory_that_is_shown() -> N
     assert none.T_map_truth is None and np.isnan(none.series["error_m"]).all()
 
 
+def test_stamps_of_frames_after_the_shown_one_stay_known() -> None:
+    frames = Frames()
+    frames.add(3)
+    every = frames.see().known_ns
+    frames.page.put(transport=Transport(frame=0))
+    seen = frames.fold.apply(frames.page.take())
+    assert len(seen.trajectory) == 1 and len(every) == 3
+    np.testing.assert_array_equal(seen.known_ns, every)
+
+
 def test_nothing_is_kept_for_a_reader_that_has_it() -> None:
     frames = Frames()
     frames.add()

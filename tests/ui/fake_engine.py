@@ -253,6 +253,7 @@ class FakeEngine:
             keyframe_poses=np.empty((0, 4, 4)),
             trajectory=np.empty((0, 3)),
             series=Snapshot().series,
+            known_ns=Snapshot().known_ns,
             T_map_truth=None,
         )
 
@@ -343,6 +344,7 @@ class FakeEngine:
             keyframe_poses=poses,
             trajectory=trajectory,
             series={name: table[:, i] for i, name in enumerate(SERIES)},
+            known_ns=np.append(snapshot.known_ns[:frame], result.stamp_ns),
             T_map_truth=offset if self._truth and frame > 10 else None,
         )
 

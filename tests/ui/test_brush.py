@@ -12,6 +12,7 @@ from app.mapping.painted import UNMARKED, marks
 from app.server.keeping import Paint, UndoPaint
 from app.server.protocol import Command, Play, Seek, StepFrame
 from app.slam import lie
+from app.slam.errors import HemislamError
 from app.slam.types import GROUND, NON_GROUND, StepResult
 from app.ui.brush import BrushPanel
 from app.ui.widgets import View
@@ -90,6 +91,17 @@ def test_what_is_marked_lies_over_the_scan_and_the_list_goes_to_its_frame(painti
     painting.engine.send(StepFrame(1))
     painting.panel.draw(painting.engine.snapshot, View())
     assert "/map/painted" not in painting.server.scene._handle_from_node_name, "another frame has no marks yet"
+
+
+def test_the_list_goes_on_to_a_later_frame_after_going_back(painting: Painting) -> None:
+    painting.panel.choose("ground")
+    painting.click(floor_point(painting))
+    word, frame = f"frame {painting.result.stamp_ns}", painting.engine.snapshot.transport.frame
+    painting.engine.send(Seek(0))
+    painting.panel._go(word, None)  # type: ignore[arg-type]
+    assert painting.sent[-1] == Seek(frame)
+    with pytest.raises(HemislamError, match="not in the trajectory yet"):
+        painting.panel._go(f"frame {painting.result.stamp_ns - 1}", None)  # type: ignore[arg-type]
 
 
 def test_the_rest_takes_the_engines_labels_and_marks_by_hand_stay(painting: Painting) -> None:
