@@ -128,11 +128,9 @@ class Workbench:
             assert time.monotonic() < deadline, state
 
     def finish(self, last: int, killed: threading.Event) -> None:
-        """Play to the end of the recording, where the last loops are found, or until a process is killed."""
-        if not self.state()["transport"]["finished"]:  # otherwise Play would start over
-            self.go_to(last)
-            self.ask("POST", "transport", json={"action": "speed", "factor": "max"})
-            self.ask("POST", "transport", json={"action": "play"})
+        """Go to the end of the recording, where the last loops are found, or until a process is killed."""
+        if not self.state()["transport"]["finished"]:
+            self.go_to(last)  # the session then goes on to the end
             self.until(lambda state: bool(state["transport"]["finished"]) or killed.is_set())
 
     def child(self, name: str) -> int | None:
