@@ -135,7 +135,7 @@ def serve(
     def build_page(viser: Any, forks: Any, folders: Folders) -> ServedPage:
         """Runs while the engine opens the recording. A fault of the recording is reported here, not in the page."""
         if recording is not None:
-            open_recording(opened, params).close()
+            open_recording(opened, session.first_params if session else params).close()
         from app.ui.workbench import Workbench
 
         return Workbench(

@@ -140,7 +140,8 @@ def test_a_server_killed_while_it_plays_is_reopened_where_it_was_and_comes_to_th
         server.ready()
         server.go_to(CHANGED_AT)
         tree = {name.partition(".")[0]: {name.partition(".")[2]: value} for name, value in CHANGE.items()}
-        server.ask("PATCH", "params", tree)
+        # The misspelt topic would take effect on restart; the session was opened, and is opened again, without it.
+        server.ask("PATCH", "params", tree | {"recording": {"lidar_topic": "/misspelt"}})
         server.ask("POST", "notes", {"text": "here it begins to drift"})
         at_least = killed_while_it_plays(server, CHANGED_AT + 20, engine_too=False)  # a real time of 2 s later
         server = Server(tmp_path, session())
