@@ -123,6 +123,8 @@ def serve(
             "--paused, --start, --duration and --truth belong to a recording; leave them out with --live."
         )
     session = read_session(recording) if recording is not None and recording.suffix == SUFFIX else None
+    if session is not None and (start or duration is not None or truth is not None):
+        raise HemislamError("--start, --duration and --truth belong to a recording; a session file has its own.")
     params = session.state.params if session else params_for(recording)
     if recording is not None:
         opened = session.opened.recording if session else recording

@@ -145,6 +145,15 @@ def test_a_session_is_repeated_though_what_it_was_compared_with_is_gone(
     assert len((tmp_path / "out" / "trajectory.tum").read_text().splitlines()) == 6
 
 
+@pytest.mark.parametrize("option", ["--start=1", "--duration=2", "--truth=gone.tum"])
+def test_serve_refuses_an_option_that_a_session_would_ignore(
+    hemislam: Call, walk: Path, tmp_path: Path, option: str
+) -> None:
+    session = tmp_path / "short.hemislam"
+    write_session(session, SavedSession(Opened(walk, nbytes=size_of(walk)), State(Params()), 3))
+    assert "belong to a recording" in hemislam("serve", session, option).refused()
+
+
 def test_a_recording_whose_imu_is_silent_is_mapped_by_the_lidar_alone_and_says_so(
     hemislam: Call, walk_without: Callable[[float], Path], tmp_path: Path
 ) -> None:
