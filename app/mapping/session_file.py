@@ -174,7 +174,8 @@ class SessionWriter:
         path, opened: None: nothing is written.
 
     Attributes:
-        path: of the file. error: why it cannot be written any more, in a sentence; "" if it can.
+        path: of the file; None once it cannot be written, since the session can then not be repeated from it.
+        error: why it cannot be written any more, in a sentence; "" if it can.
     """
 
     def __init__(self, path: Path | None = None, opened: Opened | None = None) -> None:
@@ -220,6 +221,7 @@ class SessionWriter:
             f"The session file {self.path} cannot be written ({error.strerror}); changes from now on are not saved."
         )
         log.warning(self.error)
+        self.path = None
         with contextlib.suppress(OSError):  # the rest of the line is lost
             self.close()
         self._file = None

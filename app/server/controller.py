@@ -214,13 +214,15 @@ class Controller:
         wait = self._work()
         session = self._player.session
         if session is not None and self._resuming is None:
-            self._write(session)
+            self._write(session.saved(self._state(session)))
         return wait
 
-    def _write(self, session: Session) -> None:
-        kept = not self._writer.error
-        self._writer.write(session.frame, self._state(session), ended=session.ended, known=session.furthest)
-        if kept and self._writer.error:
+    def _write(self, saved: SavedSession) -> None:
+        """Write to the session file. Say so once it cannot be written any more."""
+        path = self._writer.path
+        self._writer.write(saved.frame, saved.state, ended=saved.ended, known=saved.known)
+        if self._writer.path != path:
+            self._page.put(session_file=None)
             self._page.notice("warning", self._writer.error)
 
     def _work(self) -> float | None:
@@ -358,7 +360,7 @@ class Controller:
         self._resuming = None
         if saved is not None:
             # Written now, since this process may die on the way there.
-            self._writer.write(saved.frame, saved.state, ended=saved.ended, known=saved.known)
+            self._write(saved)
             session.resume(saved)
             self._player.resume(session, saved.frame, to_end=saved.ended)
             self._resuming = saved
@@ -392,6 +394,6 @@ class Controller:
         if session is not None:
             session.finish_saves()
             if self._resuming is None:  # otherwise the target frame is already written
-                self._write(session)
+                self._write(session.saved(self._state(session)))
             session.close()
         self._writer.close()

@@ -15,6 +15,7 @@ from app.export.points import Choice
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.kept import Note
 from app.mapping.session_file import read_session
+from app.server.fork import forked
 from app.server.keeping import AddNote
 from app.server.protocol import (
     Calibrated,
@@ -32,6 +33,7 @@ from app.server.protocol import (
     SetSpeed,
     StepFrame,
 )
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.trajectory import Trajectory, write_tum
 from app.ui.files import last_saved
@@ -373,3 +375,23 @@ def test_a_disk_that_fills_up_is_reported_once_and_playing_goes_on(
     told = [notice.text for notice in bench.do(Seek(40)).notices if "are not saved" in notice.text]
     assert len(told) == 1 and "No space left on device" in told[0]
     assert bench.see().transport.frame == 40
+    with pytest.raises(HemislamError, match="cannot be forked"):
+        forked(bench.see(), {})  # it would repeat another session
+
+
+def test_a_disk_that_is_full_when_a_session_is_reopened_is_reported(
+    kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            if '"state"' in text:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return super().write(text)
+
+    bench = Bench(None, session_folder=kept.parent)
+    opened = Path.open
+    monkeypatch.setattr(
+        Path, "open", lambda path, mode="r", **how: Full() if mode == "x" else opened(path, mode, **how)
+    )
+    told = [notice.text for notice in bench.do(OpenRecording(kept)).notices if "are not saved" in notice.text]
+    assert len(told) == 1 and bench.see().session_file is None
