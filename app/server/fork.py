@@ -164,10 +164,9 @@ class Workspace:
         """Start B on a session file of A's recording. Raises HemislamError: the recording differs, or B exists."""
         with self._lock:
             a, folder = self._place(path.stem)
-            session, session_file = read_session(path), a.engine.snapshot.session_file
-            ours = read_session(session_file).opened if session_file is not None else None
+            session, ours = read_session(path), a.engine.snapshot.recording
             theirs = session.opened
-            if ours is None or (ours.recording, ours.start_s) != (theirs.recording, theirs.start_s):
+            if ours is None or (ours.path.resolve(), ours.start_s) != (theirs.recording, theirs.start_s):
                 raise HemislamError(f"{path.name} is of {theirs.recording} from {theirs.start_s:g} s; open that first.")
             self._begin(path, session, path.stem, folder, 0)
             a.engine.send(AddNote(f"Opened {path.name} beside this session. {session.left_out}"))

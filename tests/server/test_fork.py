@@ -137,12 +137,24 @@ def test_a_fork_tells_what_was_left_out_of_a_session_file(tmp_path: Path) -> Non
     path.write_text(path.read_text().replace('"slab": 1.0', '"slab": 0.0'))
     (tmp_path / "walk.mcap").touch()
     for begin in (lambda workspace: workspace.fork("b"), lambda workspace: workspace.open(path)):
-        a = Recorder(replace(at(5), session_file=path))
+        a = Recorder(replace(at(5, name=str(tmp_path / "walk")), session_file=path))
         workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: Recorder(at(5)))
         begin(workspace)
         (note,) = (command.text for command in a.sent if isinstance(command, AddNote))
         assert "clip box and slab were left out (" in note
         workspace.close()
+
+
+def test_a_session_is_opened_beside_one_whose_file_cannot_be_written(tmp_path: Path) -> None:
+    writer = SessionWriter(tmp_path / "older.hemislam", Opened(tmp_path / "walk.mcap"))
+    writer.write(5, State(Params()))
+    writer.close()
+    (tmp_path / "walk.mcap").touch()
+    a = Recorder(at(5, name=str(tmp_path / "walk")))
+    workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: Recorder(at(5)))
+    workspace.open(tmp_path / "older.hemislam")
+    assert workspace.names == ("main", "older")
+    workspace.close()
 
 
 def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
