@@ -154,6 +154,9 @@ class PicturesPanel:
                     self._share = number / len(stations)
             part.replace(file)
             self._saved = file
+        except OSError as error:
+            why = error.strerror or error
+            raise HemislamError(f"The flight cannot be written to {file.parent}: {why}; make room there.") from None
         finally:
             part.unlink(missing_ok=True)
 

@@ -203,6 +203,19 @@ def test_why_there_is_no_picture_is_said(problem: Exception, words: str, bench: 
     assert list((tmp_path / "flights").iterdir()) == []
 
 
+def test_a_flight_that_fills_the_disk_names_its_folder(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(zipfile.ZipFile, "writestr", full)
+    bench.do(bench.panel._fly)
+    (told,) = bench.browser.told
+    assert f"{tmp_path / 'flights'}: No space left on device; make room there" in told
+    assert list((tmp_path / "flights").iterdir()) == []
+
+
 def test_more_pixels_than_a_browser_renders_are_refused(bench: Bench) -> None:
     bench.panel._width.value, bench.panel._height.value = 8192, 8192
     bench.do(bench.panel._shoot)
