@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1.reader import Header, ReaderError, RecordType
 from rosbags.typesys import Stores, get_typestore
 
 from app.sensors.log_times import FAR_NS, FEW, LATEST_NS, SET_BACK_NS, sound_span
@@ -79,6 +80,22 @@ class RosbagsStream:
         """Whether a metadata.yaml states other messages than its files hold."""
         held = chain.from_iterable(file.connections for file in self._files())
         return self._reader.is2 and _counted(self._reader.connections) != _counted(held)
+
+    def has_torn_index(self) -> bool:
+        """Whether a bag states other numbers of messages than its index lists, or fewer chunks than there are."""
+        bags: list[Any] = [] if self._reader.is2 else list(self._reader.readers)
+        for bag in bags:
+            stated = Counter[int]()
+            for chunk in bag.chunk_infos:
+                stated.update(chunk.connection_counts)
+            if stated != Counter({number: len(index) for number, index in bag.indexes.items()}):
+                return True
+            if bag.chunks and bag.chunk_infos[-1].pos == max(bag.chunks):  # rosbags has just read what follows it
+                try:
+                    Header.read(bag.bio, RecordType.CONNECTION)
+                except ReaderError:
+                    return True
+        return False
 
     def is_packed(self) -> bool:
         """Whether messages are compressed one by one, which only a metadata.yaml states."""

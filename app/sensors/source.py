@@ -170,6 +170,9 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
             f"that was killed; `sqlite3 {quoted(Path(database))} 'PRAGMA wal_checkpoint(TRUNCATE)'` moves them there"
         )
         return reader, (*found, Finding("file", "needs you", text))
+    if reader.has_torn_index():
+        text = f"its index contradicts itself, so messages may be missing without further notice; {_repair(path)}"
+        return reader, (*found, Finding("file", "needs you", text))
     if path.is_dir() and files != [path]:
         if files[0].suffix == ".bag":
             return reader, (Finding("file", "fine", f"{len(files)} .bag file(s), read as one recording"),)

@@ -98,6 +98,32 @@ def test_messages_that_a_damaged_file_has_lost_are_missed(tmp_path: Path) -> Non
     assert finding.verdict == "needs you" and "damaged" in finding.text
 
 
+def one_index_record_too_few(content: bytearray) -> None:
+    """Bytes before the last pair of connection and count."""
+    content[-8:-8] = bytes(8)
+
+
+def one_chunk_too_few(content: bytearray) -> None:
+    content[content.index(b"chunk_count=") + 12] -= 1
+
+
+@pytest.mark.parametrize("container", ["bag", "bag-lz4"])
+@pytest.mark.parametrize("damage", [one_index_record_too_few, one_chunk_too_few])
+def test_a_bag_whose_index_lists_fewer_messages_than_its_chunks_hold_says_so(
+    tmp_path: Path, container: str, damage: Callable[[bytearray], None]
+) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=30, columns=4, ros=1), container)
+    with open_recording(path, Params()) as recording:
+        assert not [finding for finding in recording.findings if finding.subject == "file"]
+    content = bytearray(path.read_bytes())
+    damage(content)
+    path.write_bytes(content)
+    with open_recording(path, Params()) as recording:
+        (told,) = [finding for finding in recording.findings if finding.subject == "file"]
+        assert recording.scan_count < 30
+    assert told.verdict == "needs you" and f"`rosbag reindex {path}`" in told.text
+
+
 @pytest.mark.parametrize("chunking", [True, False])
 @pytest.mark.parametrize("missing", ["counts", "message indexes"])
 def test_an_mcap_may_leave_out_what_its_specification_lets_it(tmp_path: Path, missing: str, chunking: bool) -> None:
