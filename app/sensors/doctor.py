@@ -18,7 +18,7 @@ from app.sensors.findings import Finding as Finding
 from app.sensors.findings import FindingVerdict
 from app.sensors.layout import settle_cloud
 from app.sensors.probe import choose_topic, probe_clouds
-from app.sensors.recording import LACKS, ImuEntry, OtherEntry, ScanEntry, open_recording
+from app.sensors.recording import LACKS, Entry, ImuEntry, LostEntry, ScanEntry, open_recording
 from app.sensors.sequencer import STUCK_SAMPLES, Counts, Sequencer
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
@@ -52,7 +52,7 @@ def examine(
         return _not_mappable(path, params, str(error))
     with recording:
         census = _Census(recording.sequencer())
-        damage, number = [], 0
+        damage, number = list[Finding](), 0
         try:
             for number, entry in enumerate(recording.entries(), 1):
                 census.add(entry)
@@ -62,6 +62,9 @@ def examine(
                 damage = [Finding(DAMAGE, "needs you", f"{LACKS}; copy {path} again, or use what is there")]
         except HemislamError as error:
             damage = [Finding(DAMAGE, "needs you", str(error))]
+        if census.lost:
+            text = f"{census.lost[0]}; {len(census.lost)} messages in all; the others are used. Copy {path} again"
+            damage.insert(0, Finding(DAMAGE, "needs you", text))
         census.take(last=True)
         progress(1.0)
         scans, imu = census.times()
@@ -98,6 +101,7 @@ class _Census:
         scan_times: log time, start and end of each scan, ns. imu_times: log time and stamp of each sample.
         places: points that the messages have room for. nan, returns: how many of these are NaN, or returns.
         refused: points that cannot be returns. copies: scans that came twice. reasons: why scans are left out.
+        lost: where the file is damaged, for each message that cannot be read.
     """
 
     sequencer: Sequencer
@@ -111,8 +115,9 @@ class _Census:
     last: Scan | None = None
     last_sample: tuple[int, Vector, Vector] | None = None
     reasons: Counter[str] = field(default_factory=Counter)
+    lost: list[str] = field(default_factory=list)
 
-    def add(self, entry: ScanEntry | ImuEntry | OtherEntry) -> None:
+    def add(self, entry: Entry) -> None:
         if isinstance(entry, ImuEntry):
             sample = (entry.stamp_ns, entry.gyro, entry.accel)
             if sample != self.last_sample:  # a repeated sample says nothing about the rate
@@ -132,6 +137,10 @@ class _Census:
                 self.places += len(entry.cloud)
                 self.nan += int(np.isnan(entry.cloud.xyz()).any(axis=1).sum())
             self.sequencer.add_scan(entry.scan)
+        elif isinstance(entry, LostEntry):
+            self.lost.append(entry.said)
+            if entry.scan is not None:
+                self.sequencer.add_scan(entry.scan)
         self.take(last=False)
 
     def take(self, *, last: bool) -> None:

@@ -16,7 +16,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from app.sensors.log_times import LATEST_NS, SET_BACK_NS, mended
-from app.sensors.ros import ENCODINGS, Deserialiser, ros2_type
+from app.sensors.ros import ENCODINGS, Deserialiser, read_or_lose, ros2_type
 from app.sensors.unpacking import LIMIT, UNPACK, TooLarge
 from app.slam.errors import printable
 
@@ -74,7 +74,7 @@ class McapStream:
             added_ns += set_back.get(number, 0)
             log_ns = self._better.get(number, log_ns)
             if topic in topics and start_ns <= log_ns + added_ns < stop_ns:
-                yield topic, log_ns + added_ns, self._deserialiser.read(data, kind, encoding)
+                yield topic, log_ns + added_ns, read_or_lose(self._deserialiser.read, data, kind, encoding)
         if self.pieces[-1] in self.cut and stop_ns > self.end_ns:
             raise EndOfFile("the file ends here, in the middle of a record")
 
@@ -97,7 +97,10 @@ class McapStream:
         with piece.open("rb") as file:
             try:
                 for record in _unpacked(file):
-                    if isinstance(record, Schema):
+                    if isinstance(record, Chunk):  # a damaged one
+                        for topic, kind, encoding in channels.values():
+                            yield topic, kind, min(record.message_start_time, LATEST_NS), encoding, b""
+                    elif isinstance(record, Schema):
                         schemas[record.id] = record
                     elif isinstance(record, Channel) and record.message_encoding in ENCODINGS:
                         schema, encoding = schemas.get(record.schema_id), record.message_encoding
@@ -113,14 +116,22 @@ class McapStream:
 
 
 def _unpacked(file: IO[bytes]) -> Iterator[McapRecord]:
-    """The records of a file and of its chunks. Raises TooLarge, or what mcap and the compressions raise."""
+    """The records of a file and of its chunks; a chunk that is damaged comes as it is. Raises what mcap raises."""
     for record in StreamReader(file, emit_chunks=True, record_size_limit=LIMIT).records:
         if not isinstance(record, Chunk):
             yield record
             continue
-        if record.uncompressed_size > LIMIT:
-            raise TooLarge
-        if record.compression:
-            data = UNPACK[record.compression](record.data, record.uncompressed_size)
-            record = replace(record, compression="", data=data)
-        yield from breakup_chunk(record)
+        try:
+            records = _records_in(record)
+        except Exception:  # of the compressions, struct and mcap
+            records = [record]
+        yield from records
+
+
+def _records_in(chunk: Chunk) -> list[McapRecord]:
+    if chunk.uncompressed_size > LIMIT:
+        raise TooLarge
+    if chunk.compression:
+        data = UNPACK[chunk.compression](chunk.data, chunk.uncompressed_size)
+        chunk = replace(chunk, compression="", data=data)
+    return breakup_chunk(chunk, validate_crc=True)

@@ -30,7 +30,7 @@ from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
 from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_types
 from app.sensors.rings import line_findings
-from app.sensors.ros import imu_values, stamp_ns
+from app.sensors.ros import Lost, imu_values, stamp_ns
 from app.sensors.sequencer import Sequencer
 from app.sensors.source import LOG_MARGIN_NS, Mark, Source
 from app.slam.errors import HemislamError
@@ -39,6 +39,7 @@ from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan, Vector
 
 SILENCE_S = 0.5
 """A gap without scans at the end, while the IMU continues, is reported if it is longer than this."""
+LOST = "the file is damaged there"
 LACKS = "the file is damaged: its index tells of more messages than there are"
 NO_IMU = Finding(
     "IMU topic",
@@ -69,11 +70,23 @@ class ImuEntry:
 
 
 @dataclass(frozen=True, slots=True)
+class LostEntry:
+    """A message that cannot be read. scan: in its place, if it was a point cloud. said: where, and why."""
+
+    log_ns: int
+    scan: DroppedScan | None
+    said: str
+
+
+@dataclass(frozen=True, slots=True)
 class OtherEntry:
     """A message of a sensor other than LiDAR and IMU."""
 
     log_ns: int
     samples: Samples
+
+
+Entry = ScanEntry | ImuEntry | OtherEntry | LostEntry
 
 
 class Recording(AbstractContextManager["Recording"]):
@@ -110,6 +123,7 @@ class Recording(AbstractContextManager["Recording"]):
         imu_findings: list[Finding] = []
         if self.imu_topic:
             imu, self._imu_stamped, imu_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
+        self._log_after_stamp_ns = 0
         self._leaps = self._find_leaps()
         source.first_scan_ns = probes[0].log_ns
         self.start_ns = scans[0].stamp_ns + added_ns(self._leaps.lidar, probes[0].log_ns)
@@ -195,7 +209,7 @@ class Recording(AbstractContextManager["Recording"]):
 
     def entries(
         self, first_ns: int | None = None, stop_ns: int | None = None, after: Mark | None = None
-    ) -> Iterator[ScanEntry | ImuEntry | OtherEntry]:
+    ) -> Iterator[Entry]:
         """Decoded scans and samples in the order of the file, from some time before `first` to some time after `stop`.
 
         Args:
@@ -211,11 +225,16 @@ class Recording(AbstractContextManager["Recording"]):
 
     def _read(
         self, topics: tuple[str, ...], log_first: int | None, log_stop: int | None, after: Mark | None
-    ) -> Iterator[ScanEntry | ImuEntry | OtherEntry]:
+    ) -> Iterator[Entry]:
         """Entries of some topics that were logged within [log_first, log_stop)."""
         offset_ns = round(self.params.recording.imu_time_offset * 1e9)
-        for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after):
-            if topic == self.lidar_topic:
+        for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after, lost=True):
+            if isinstance(message, Lost):
+                stamp = log_ns + added_ns(self._leaps.log, log_ns) - self._log_after_stamp_ns
+                at_s = (log_ns - self._source.start_ns) / 1e9
+                said = f"the file is damaged {at_s:.1f} s after its start: what was there is lost ({message.why})"
+                yield LostEntry(log_ns, DroppedScan(stamp, LOST) if topic == self.lidar_topic else None, said)
+            elif topic == self.lidar_topic:
                 cloud, scan = read_scan(message, log_ns, self._layout)
                 if added := added_ns(self._leaps.lidar, log_ns):
                     scan = replace(scan, stamp_ns=scan.stamp_ns + added)
@@ -324,8 +343,13 @@ class Measurements(Iterator[Measurement | DroppedScan]):
                 for entry in recording.entries(first_ns if start_s > 0 else None, stop_ns, self._message):
                     for text in recording.leaps_told(self._message.log_ns, entry.log_ns) if self._message else ():
                         sequencer.notice(text)
-                    self._message = Mark.after(self._message, entry.log_ns)
-                    if isinstance(entry, ScanEntry):
+                    before, self._message = self._message, Mark.after(self._message, entry.log_ns)
+                    if isinstance(entry, LostEntry):
+                        if before is None or before.log_ns != entry.log_ns:  # the messages of a chunk have one time
+                            sequencer.notice(entry.said)
+                        if entry.scan is not None:
+                            sequencer.add_scan(entry.scan)
+                    elif isinstance(entry, ScanEntry):
                         if entry.scan.stamp_ns >= first_ns and (stop_ns is None or entry.scan.stamp_ns < stop_ns):
                             sequencer.add_scan(entry.scan)
                     elif isinstance(entry, OtherEntry):

@@ -30,6 +30,21 @@ DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "
 _DATATYPE_OF = {np.dtype(kind): number for number, kind in DATATYPES.items()}
 
 
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A message that cannot be read. why: in the words of the library."""
+
+    why: str
+
+
+def read_or_lose(read: Callable[..., Any], data: bytes, *kind: str) -> Any:
+    """`read(data, *kind)`, or Lost if it fails. Messages of a chunk that cannot be unpacked come without bytes."""
+    try:
+        return read(data, *kind) if data else Lost("a chunk of messages is not as it was written")
+    except Exception as error:  # the libraries let errors of struct, numpy and assert pass
+        return Lost(brief(error))
+
+
 class Deserialiser:
     """Reads messages of the standard types, and of those whose definitions it was given."""
 
@@ -64,6 +79,12 @@ class Deserialiser:
         if encoding not in self._stores:
             self._stores[encoding] = get_typestore(_STORES[encoding])
         return self._stores[encoding]
+
+
+def brief(error: BaseException) -> str:
+    """The library's own words, shortened to fit into a sentence."""
+    text = " ".join(str(error).split()).rstrip(".")
+    return text[:120] or type(error).__name__
 
 
 def ros2_type(name: str) -> str:

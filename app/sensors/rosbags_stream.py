@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from itertools import chain, islice, pairwise
+from itertools import chain, islice, pairwise, repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,8 +13,8 @@ from rosbags.rosbag1.reader import Header, ReaderError, RecordType
 from rosbags.typesys import Stores, get_typestore
 
 from app.sensors.log_times import FAR_NS, FEW, LATEST_NS, SET_BACK_NS, sound_span
-from app.sensors.ros import Deserialiser
-from app.sensors.unpacking import limit_rosbags
+from app.sensors.ros import Deserialiser, read_or_lose
+from app.sensors.unpacking import adapt_rosbags
 from app.slam.errors import printable
 from app.slam.types import I64
 
@@ -33,7 +33,7 @@ class RosbagsStream:
 
     def __init__(self, files: list[Path]) -> None:
         """Raises whatever the library raises for a file that it cannot read."""
-        limit_rosbags()
+        adapt_rosbags()
         self._links = TemporaryDirectory()  # of links whose names end as rosbags expects
         files = [self._in_small_letters(path) for path in files]
         self._standard = Deserialiser()
@@ -52,8 +52,28 @@ class RosbagsStream:
         connections = [one for one in self._reader.connections if printable(one.topic) in topics]
         if not connections:  # rosbags would read all topics then
             return
-        for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
-            yield printable(connection.topic), log_ns, self._deserialised(raw, connection.msgtype)
+        for connection, log_ns, raw in self._raw(connections, start_ns, stop_ns):
+            yield printable(connection.topic), log_ns, read_or_lose(self._deserialised, raw, connection.msgtype)
+
+    def _raw(self, connections: list[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
+        """(connection, log time ns, bytes). In a bag, those of a chunk that cannot be unpacked have no bytes; for MCAP,
+        see `adapt_rosbags`."""
+        while True:
+            try:
+                for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
+                    yield connection, log_ns, raw
+                    start_ns = log_ns + 1
+                return
+            except Exception as error:  # rosbags lets errors of bz2, lz4, struct and assert pass
+                ends = [chunk.end_time for bag in self._bags() for chunk in bag.chunk_infos]
+                end_ns = min((end for end in ends if end > start_ns), default=0)
+                if not end_ns or isinstance(error, OSError):
+                    raise
+            for connection in connections:
+                times = (entry.time for entry in connection.owner.indexes[connection.id])
+                lost = sum(start_ns <= log_ns < min(end_ns, stop_ns) for log_ns in times)
+                yield from repeat((connection, max(start_ns, self.start_ns), b""), lost)
+            start_ns = end_ns
 
     def may_be_disordered(self) -> bool:
         """Whether chunks of an MCAP step back in time, last too long, or are few and far away; or there are none."""
@@ -83,8 +103,7 @@ class RosbagsStream:
 
     def has_torn_index(self) -> bool:
         """Whether a bag states other numbers of messages than its index lists, or fewer chunks than there are."""
-        bags: list[Any] = [] if self._reader.is2 else list(self._reader.readers)
-        for bag in bags:
+        for bag in self._bags():
             stated = Counter[int]()
             for chunk in bag.chunk_infos:
                 stated.update(chunk.connection_counts)
@@ -115,13 +134,17 @@ class RosbagsStream:
 
     def _log_times(self) -> I64:
         """The log times of all messages of bags and databases."""
-        bags = chain.from_iterable(getattr(reader, "indexes", {}).values() for reader in self._reader.readers)
+        bags = chain.from_iterable(bag.indexes.values() for bag in self._bags())
         times = [np.array([entry.time for entry in index], np.int64) for index in bags]
         for file in self._files():
             if (database := getattr(file, "dbconn", None)) is not None:
                 rows = database.execute("SELECT CAST(ifnull(timestamp, 0) AS INTEGER) FROM messages")
                 times.append(np.fromiter(chain.from_iterable(rows), np.int64))
         return np.concatenate([np.empty(0, np.int64), *times])
+
+    def _bags(self) -> list[Any]:
+        """The ROS 1 bags, as rosbags has them open."""
+        return [] if self._reader.is2 else list(self._reader.readers)
 
     def _files(self) -> Iterator[Any]:
         """The ROS 2 files, as rosbags has them open."""

@@ -15,6 +15,7 @@ from app.sensors.live.pcap import CaptureError
 from app.sensors.log_times import LATEST_NS
 from app.sensors.mcap_stream import McapStream
 from app.sensors.ouster import OusterStream, metadata_beside
+from app.sensors.ros import Lost, brief
 from app.sensors.rosbags_stream import RosbagsStream
 from app.slam.errors import HemislamError, quoted
 from app.slam.text_files import is_file
@@ -99,14 +100,18 @@ class Source(AbstractContextManager["Source"]):
         start_ns: int | None = None,
         stop_ns: int | None = None,
         after: Mark | None = None,
+        *,
+        lost: bool = False,
     ) -> Iterator[tuple[str, int, Any]]:
         """(topic, log time ns, deserialised message) of these topics, logged within [start, stop).
 
         Args:
             after: the last message of an earlier call with the same arguments; this call continues from there.
+            lost: give `Lost` for each message that cannot be read; otherwise these are left out.
 
         Raises:
-            HemislamError: the file is damaged here; all earlier messages have been given.
+            HemislamError: the file cannot be read beyond this place, where all earlier messages have been given; or
+                all of its messages would be left out.
         """
         first, stop = start_ns or 0, LATEST_NS + 1 if stop_ns is None else stop_ns
         known = 0
@@ -114,24 +119,31 @@ class Source(AbstractContextManager["Source"]):
             known, first = (after.at_log_ns, after.log_ns) if self._stream.by_log_time else (after.read, first)
         stream = islice(self._stream.messages(topics, first, stop), known, None)
         log_ns = self.start_ns
+        left_out, given = "", lost
         while True:
             try:
                 entry = next(stream, None)
             except Exception as error:  # rosbags lets errors of zstd, lz4, sqlite, struct and assert pass
-                at = (log_ns - self.start_ns) / 1e9
-                advice = _repair(self.path)
-                usable = (log_ns - self.first_scan_ns - LOG_MARGIN_NS) / 1e9 - 0.5
-                if usable > 1:
-                    advice = (
-                        f"what comes before can be used (start hemislam with --duration {usable:.1f}), and {advice}"
-                    )
-                raise HemislamError(
-                    f"{self.path} is damaged {at:.1f} s after its start ({_brief(error)}); {advice}."
-                ) from error
+                raise self._damaged(log_ns, brief(error)) from error
             if entry is None:
-                return
+                break
             log_ns = entry[1]
-            yield entry
+            if lost or not isinstance(entry[2], Lost):
+                given = True
+                yield entry
+            else:
+                left_out = left_out or entry[2].why
+        if left_out and not given:
+            raise self._damaged(self.start_ns, left_out)
+
+    def _damaged(self, log_ns: int, why: str) -> HemislamError:
+        """That nothing can be read after this log time."""
+        advice = _repair(self.path)
+        usable = (log_ns - self.first_scan_ns - LOG_MARGIN_NS) / 1e9 - 0.5
+        if usable > 1:
+            advice = f"what comes before can be used (start hemislam with --duration {usable:.1f}), and {advice}"
+        at = (log_ns - self.start_ns) / 1e9
+        return HemislamError(f"{self.path} is damaged {at:.1f} s after its start ({why}); {advice}.")
 
     def lacks(self, topics: tuple[str, ...], read: int) -> bool:
         """Whether `read` messages, from a complete reading of these topics, are fewer than the file's index states."""
@@ -155,7 +167,7 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
     except Exception as error:  # as above
         if (salvaged := _front_to_back(path, files)) is None:
             raise HemislamError(_refusal(path, error)) from error
-        return salvaged, (_salvage_finding(salvaged, _brief(error)),)
+        return salvaged, (_salvage_finding(salvaged, brief(error)),)
     unindexed = reader.is_unindexed()
     in_order = _front_to_back(path, files) if unindexed or reader.may_be_disordered() else None
     if in_order and (unindexed or in_order.wild or not in_order.sorted):
@@ -189,7 +201,7 @@ def _read_by_rosbags(path: Path, files: list[Path]) -> tuple[RosbagsStream, tupl
         if not stream.is_contradicted():
             return stream, ()
     except Exception as error:
-        stream, why = error, _brief(error)
+        stream, why = error, brief(error)
     inside = _single_files(path, files)
     with suppress(Exception):
         if inside not in ([], files) and not (bare := RosbagsStream(inside)).is_packed():
@@ -247,14 +259,14 @@ def _salvage_finding(stream: McapStream, why: str) -> Finding:
 
 
 def _refusal(path: Path, error: Exception) -> str:
-    brief = _brief(error)
+    why = brief(error)
     if isinstance(error, PermissionError):
         return f"{path} cannot be opened (permission denied); change its permissions or copy it."
-    if path.is_dir() and "metadata" in brief.lower():
+    if path.is_dir() and "metadata" in why.lower():
         return f"The metadata.yaml of {path} cannot be understood; {_REPAIR[''].format(path=quoted(path))}."
-    if "not indexed" in brief:
+    if "not indexed" in why:
         return f"{path} has no index, as after a recorder that was killed; {_repair(path)}."
-    return f"{path} is cut off or damaged ({brief}); {_repair(path)}."
+    return f"{path} is cut off or damaged ({why}); {_repair(path)}."
 
 
 def _recording_files(path: Path) -> list[Path]:
@@ -341,9 +353,3 @@ def _repair(path: Path) -> str:
         elif {file.suffix for file in inside} == {".bag"}:
             return _REPAIR[".bag"].format(path=f"{quoted(path)}/*.bag")
     return _REPAIR["" if path.is_dir() else path.suffix.lower()].format(path=quoted(path))
-
-
-def _brief(error: BaseException) -> str:
-    """The library's own words, shortened to fit into our sentence."""
-    text = " ".join(str(error).split()).rstrip(".")
-    return text[:120] or type(error).__name__

@@ -5,14 +5,16 @@ A chunk of a few kilobytes may unpack to gigabytes of zeros.
 
 import bz2
 import io
+from collections.abc import Iterator
+from itertools import repeat
 from types import SimpleNamespace
 from typing import IO, Any, Final, Self
 
 import lz4.frame
 import rosbags.rosbag1.reader
 import rosbags.rosbag2.reader
-import rosbags.rosbag2.storage_mcap
 import zstandard
+from rosbags.rosbag2 import storage_mcap
 
 LIMIT: Final = 256 << 20
 """Most bytes of a chunk, or of a message that is compressed on its own. Writers make chunks of about 1 MB."""
@@ -42,12 +44,17 @@ def unpack_lz4(data: bytes, size: int = LIMIT) -> bytes:
 
 
 def unpack_bz2(data: bytes) -> bytes:
-    """At most `LIMIT` bytes. Raises TooLarge, or bz2's error."""
-    return _checked(bz2.BZ2Decompressor().decompress(data, max_length=LIMIT + 1), LIMIT)
+    """At most `LIMIT` bytes. Raises TooLarge, or ValueError: bz2's error is an OSError, like one of the disk."""
+    try:
+        return _checked(bz2.BZ2Decompressor().decompress(data, max_length=LIMIT + 1), LIMIT)
+    except OSError as error:
+        raise ValueError(error) from error
 
 
 UNPACK: Final = {"zstd": unpack_zstd, "lz4": unpack_lz4}
 """Functions by the names that MCAP gives to compressions."""
+
+_READ_CHUNK: Final = storage_mcap.msgsrc
 
 
 def _checked(data: bytes, size: int) -> bytes:
@@ -79,9 +86,33 @@ class _LimitedFile:
         self._reader.close()  # type: ignore[no-untyped-call]  # zstandard leaves it untyped
 
 
-def limit_rosbags() -> None:
-    """Make rosbags use the functions above: it has no option for a limit."""
+def _message_or_nothing(data: bytes) -> bytes:
+    """A message that is compressed on its own; empty if it is damaged."""
+    try:
+        return unpack_zstd(data)
+    except (TooLarge, zstandard.ZstdError):
+        return b""
+
+
+def _messages_or_nothing(
+    chunk: storage_mcap.ChunkInfo, connections: dict[int, Any], start_ns: int, stop_ns: int, file: Any
+) -> Iterator[storage_mcap.Msg]:
+    """The messages of a chunk of an MCAP by time; empty ones at its start if the chunk is damaged."""
+    try:
+        yield from _READ_CHUNK(chunk, connections, start_ns, stop_ns, file)
+    except OSError:
+        raise
+    except Exception:  # rosbags lets errors of zstd, lz4 and struct pass; it has not yet given any message then
+        if chunk.message_start_time >= start_ns:
+            for number, connection in connections.items():
+                empty = storage_mcap.Msg(chunk.message_start_time, chunk.chunk_start_offset, connection, b"")
+                yield from repeat(empty, chunk.channel_count.get(number, 0))
+
+
+def adapt_rosbags() -> None:
+    """Make rosbags use the functions above: it has no option for a limit, and stops at the first damaged chunk."""
     rosbags.rosbag1.reader.decompressors |= {"bz2": unpack_bz2, "lz4": unpack_lz4}
-    rosbags.rosbag2.storage_mcap.DECOMPRESSORS |= {"lz4": unpack_lz4, "zstd": unpack_zstd}
-    limited: Any = SimpleNamespace(decompress=unpack_zstd, open=lambda file, mode: _LimitedFile(file))
+    storage_mcap.DECOMPRESSORS |= {"lz4": unpack_lz4, "zstd": unpack_zstd}
+    storage_mcap.msgsrc = _messages_or_nothing  # type: ignore[assignment]  # it is a generator
+    limited: Any = SimpleNamespace(decompress=_message_or_nothing, open=lambda file, mode: _LimitedFile(file))
     rosbags.rosbag2.reader.zstd = limited  # type: ignore[attr-defined]  # of messages and files compressed on their own

@@ -1,6 +1,5 @@
 """Unusable recordings are refused with one sentence that says what is wrong, where, and what to do."""
 
-import sqlite3
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -174,26 +173,6 @@ def test_an_unindexed_bag_names_the_command_that_repairs_it(tmp_path: Path) -> N
     content[at : at + 8] = bytes(8)
     path.write_bytes(content)
     assert "has no index" in refusal(path) and "rosbag reindex" in refusal(path)
-
-
-@pytest.mark.parametrize("container", ["bag-bz2", "small-chunks", "sqlite3-message"])
-def test_damage_in_the_middle_gives_all_before_it_and_then_says_when(tmp_path: Path, container: str) -> None:
-    path = rig.write(tmp_path / "walk", rig.walk(turns=60, columns=40, ros=1 if "bag" in container else 2), container)
-    if container == "sqlite3-message":
-        with sqlite3.connect(next(path.glob("*.db3"))) as database:
-            database.execute("UPDATE messages SET data = x'0102' WHERE id = (SELECT max(id) * 2 / 3 FROM messages)")
-        database.close()
-    else:
-        content = bytearray(path.read_bytes())
-        at = len(content) * 2 // 3
-        content[at : at + 2000] = bytes(2000)
-        path.write_bytes(content)
-    used = 0
-    with open_recording(path, Params()) as recording, pytest.raises(HemislamError) as caught:
-        for entry in recording.measurements():
-            used += isinstance(entry, Measurement)
-    assert "is damaged" in str(caught.value) and "s after its start" in str(caught.value)
-    assert 20 <= used < 60
 
 
 # --- contents ----------------------------------------------------------------------------------------

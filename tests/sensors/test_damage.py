@@ -1,29 +1,29 @@
-"""Tests app/sensors/source.py: the advice for damaged files works as written."""
+"""Tests app/sensors/source.py: a damaged place costs little, and the advice for damaged files works as written."""
 
 import re
 import shlex
+import sqlite3
+from contextlib import nullcontext
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from app.sensors.recording import open_recording
+from app.sensors.doctor import DAMAGE, examine
+from app.sensors.recording import LOST, open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.types import Measurement
+from app.slam.types import DroppedScan, Measurement
 from tests.sensors import rig
 
 
 @pytest.mark.parametrize("imu_first_s", [0.05, 3.0])
-@pytest.mark.parametrize("kind", ["cut", "hole"])
-def test_the_duration_that_a_damaged_file_advises_ends_before_the_damage(
-    tmp_path: Path, kind: str, imu_first_s: float
-) -> None:
+def test_the_duration_that_a_damaged_file_advises_ends_before_the_damage(tmp_path: Path, imu_first_s: float) -> None:
     """--duration counts from the first scan, which may come seconds after the first IMU sample."""
     entries = rig.walk(turns=160, columns=20, imu_start_ns=-round(imu_first_s * 1e9))
     path = rig.write(tmp_path / "walk", sorted(entries, key=lambda entry: entry[1]), "small-chunks")
-    content = bytearray(path.read_bytes())
-    half = len(content) // 2
-    path.write_bytes(content[:half] if kind == "cut" else content[:half] + bytes(2000) + content[half + 2000 :])
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
     with open_recording(path, Params()) as recording:
         with pytest.raises(HemislamError) as caught:
             list(recording.measurements())
@@ -31,6 +31,47 @@ def test_the_duration_that_a_damaged_file_advises_ends_before_the_damage(
         used = [entry for entry in recording.measurements(0.0, float(advised)) if isinstance(entry, Measurement)]
     assert len(used) == pytest.approx(float(advised) / (rig.PERIOD_NS / 1e9), abs=2)
     assert len(used) > 30
+
+
+def damaged(folder: Path, container: str) -> Path:
+    """A walk of 60 scans and 2.4 s of others, in which a hole of 2000 bytes, or of one message, ends at two thirds."""
+    entries = rig.walk(turns=60, columns=40, ros=1 if "bag" in container else 2)
+    path = rig.write(folder / "walk", entries, container.removesuffix("-cut"))
+    if container == "sqlite3-message":
+        with sqlite3.connect(next(path.glob("*.db3"))) as database:
+            database.execute("UPDATE messages SET data = x'0102' WHERE id = (SELECT max(id) * 2 / 3 FROM messages)")
+        database.close()
+        return path
+    content = bytearray(path.read_bytes())
+    at = len(content) // 2
+    content[at : at + 2000] = bytes(2000)
+    path.write_bytes(content[: at * 3 // 2] if container.endswith("-cut") else content)
+    return path
+
+
+@pytest.mark.parametrize("container", ["bag-bz2", "bag-lz4", "small-chunks", "small-chunks-cut", "sqlite3-message"])
+def test_a_damaged_chunk_costs_no_more_than_what_it_held(tmp_path: Path, container: str) -> None:
+    """It is said where, also by a reading that continues an earlier one."""
+    read: list[Measurement | DroppedScan] = []
+    with open_recording(damaged(tmp_path, container), Params()) as recording:
+        reading = recording.measurements()
+        ends = pytest.raises(HemislamError, match="the file ends here") if container.endswith("-cut") else nullcontext()
+        with ends:
+            while (entry := next(reading, None)) is not None:
+                read.append(entry)
+                reading = recording.measurements(after=reading.place())
+    whole = 45 if container.endswith("-cut") else 60
+    used = [entry for entry in read if isinstance(entry, Measurement)]
+    dropped = [entry.reason for entry in read if isinstance(entry, DroppedScan)]
+    assert whole - 5 <= len(used) < whole + 1 and set(dropped) <= {LOST}
+    assert used[-1].scan.stamp_ns - used[0].scan.stamp_ns > (whole - 3) * rig.PERIOD_NS
+    (said,) = [notice for entry in used for notice in entry.notices if "damaged" in notice]
+    at = float(re.findall(r"damaged ([\d.]+) s after its start: what was there is lost \(", said)[0])
+    gaps = [a for a, b in pairwise(used) if b.scan.stamp_ns - a.scan.stamp_ns > 1.5 * rig.PERIOD_NS]
+    assert not gaps or at == pytest.approx((gaps[0].scan.stamp_ns - rig.START_NS) / 1e9, abs=0.35)
+    if not container.endswith("-cut"):
+        (finding,) = [finding for finding in examine(recording.path, Params()) if finding.subject == DAMAGE]
+        assert finding.verdict == "needs you" and finding.text.startswith(said)
 
 
 def test_paths_in_commands_are_written_as_a_shell_takes_them(tmp_path: Path) -> None:

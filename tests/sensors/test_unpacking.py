@@ -107,7 +107,7 @@ def test_the_limit_is_in_force_in_rosbags() -> None:
     import rosbags.rosbag2.reader
     import rosbags.rosbag2.storage_mcap
 
-    unpacking.limit_rosbags()
+    unpacking.adapt_rosbags()
     assert {"bz2", "lz4"} <= {str(key) for key in rosbags.rosbag1.reader.decompressors}
     assert {"zstd", "lz4"} <= rosbags.rosbag2.storage_mcap.DECOMPRESSORS.keys()
     source = Path(rosbags.rosbag2.reader.__file__).read_text()
