@@ -44,7 +44,7 @@ from app.slam.keyframe_id import KeyframeId
 from app.slam.loops import edit_files
 from app.slam.loops.edits import LoopEdit
 from app.slam.params import Params
-from app.slam.text_files import free_path, make_folder, shortened, write_texts
+from app.slam.text_files import free_path, make_folder, named, shortened, write_texts
 from app.slam.user_text import read_text
 
 log = logging.getLogger(__name__)
@@ -229,7 +229,7 @@ class SessionWriter:
 
 def new_path(folder: Path, recording: Path) -> Path:
     """A free name for the session file of a recording; names sort by time."""
-    return free_path(folder / f"{shortened(recording.stem)}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
+    return free_path(folder / f"{shortened(named(recording).stem)}-{datetime.now():%Y%m%d-%H%M%S}", SUFFIX)
 
 
 def write_session(path: Path, session: SavedSession) -> None:

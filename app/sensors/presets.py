@@ -10,7 +10,7 @@ from app.sensors.livox import CUSTOM_MSGS
 from app.sensors.rings import elevation
 from app.slam.errors import HemislamError
 from app.slam.params import Params
-from app.slam.text_files import is_file
+from app.slam.text_files import beside, is_file
 
 _H2LID_MOUNT = {"translation": [0.0175, 0.0276, -0.1083], "rotation": [0.0, 0.0, 0.0]}
 
@@ -113,7 +113,7 @@ MERGED = f"{CALIBRATED} into the one kept as .old."
 
 def sidecar(recording: Path) -> Path:
     """The path of a recording's own parameters: `<stem>.params.yaml` beside it."""
-    return recording.parent / f"{recording.name if recording.is_dir() else recording.stem}.params.yaml"
+    return beside(recording, ".params.yaml")
 
 
 def uncalibrated(recording: Path) -> Path | None:

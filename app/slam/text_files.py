@@ -27,6 +27,18 @@ def free_path(stem: Path, suffix: str = "", *, always_numbered: bool = False) ->
     return next(path for name in names if not (path := stem.with_name(f"{stem.name}{name}{suffix}")).exists())
 
 
+def beside(recording: Path, ending: str) -> Path:
+    """The path of a file beside a recording: its name, without the suffix of a file, and this ending."""
+    recording = named(recording)
+    name = recording.name if recording.is_dir() else recording.stem
+    return recording.parent / f"{name}{ending}"
+
+
+def named(path: Path) -> Path:
+    """This path; absolute if its end is no name, as in `.` and `..`."""
+    return path.resolve() if path.name in ("", "..") else path
+
+
 def shortened(name: str) -> str:
     """A name, cut at its end if it is so long that a file name would have no room for an extension."""
     while len(os.fsencode(name)) > _LONGEST:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from app.slam.errors import HemislamError
-from app.slam.text_files import is_file
+from app.slam.text_files import beside, is_file
 from app.slam.types import F64, I64
 from app.slam.user_text import as_numbers, read_rows
 
@@ -116,8 +116,7 @@ def stamp_text(stamp_ns: int) -> str:
 
 def truth_beside(recording: Path) -> Path | None:
     """The truth file beside a recording, `<name>_truth.tum`, if there is one."""
-    name = recording.name if recording.is_dir() else recording.stem
-    truth = recording.with_name(f"{name}_truth.tum")
+    truth = beside(recording, "_truth.tum")
     return truth if is_file(truth) else None
 
 

@@ -62,6 +62,23 @@ def test_truth_beside_the_recording_is_used_and_named(first: tuple[Any, Path]) -
     assert "ATE" in first[0].out
 
 
+@pytest.mark.parametrize("here", [".", "..", "inside/.."])
+def test_a_recording_named_by_dots_has_the_files_beside_it_too(
+    hemislam: Call, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: str
+) -> None:
+    folder = tmp_path / "walk"
+    (folder / "inside").mkdir(parents=True)
+    (folder / "walk.mcap").symlink_to(walk)
+    truth = walk.with_name("walk_truth.tum").read_bytes()
+    (tmp_path / "walk_truth.tum").write_bytes(truth)
+    (tmp_path / "walk.params.yaml").write_text("ground: {alpha: 31}")
+    monkeypatch.chdir(at := folder / "inside" if here == ".." else folder)
+    run = hemislam("run", here, "--no-calibrate", "--duration", "2", "--out", tmp_path / "out", folder=at)
+    assert run.code == 0 and "walk_truth.tum" in run.out
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["parameters"]["ground"]["alpha"] == 31
+    assert new_path(tmp_path, Path(here)).name.startswith("walk-")
+
+
 def test_without_a_terminal_only_the_summary_is_printed(first: tuple[Any, Path]) -> None:
     assert first[0].err == ""
     assert str(first[1]) in first[0].out
