@@ -163,7 +163,7 @@ def simulate(
     rate: Annotated[int, typer.Option("--rate", metavar="HZ", help="Revolutions per second, 10 or 20.")] = 10,
     every_block: Annotated[
         int | None,
-        typer.Option("--every-block", metavar="K", help="Fire only at every K-th azimuth, for a small file."),
+        typer.Option("--every-block", min=1, metavar="K", help="Fire only at every K-th azimuth, for a small file."),
     ] = None,
     coordinate_step: Annotated[
         float, typer.Option("--coordinate-step", metavar="METRES", help="Round x, y, z for a smaller file; 0: do not.")

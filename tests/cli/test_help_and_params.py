@@ -114,6 +114,12 @@ def test_simulate_keeps_a_file_that_is_there_and_names_the_scenes(hemislam: Call
     assert "corridor" in hemislam("simulate", "moon", "--out", tmp_path / "moon.mcap").refused()
 
 
+@pytest.mark.parametrize("every", [0, -1])
+def test_simulate_refuses_a_number_of_azimuths_that_is_none(hemislam: Call, tmp_path: Path, every: int) -> None:
+    done = hemislam("simulate", "room", "--out", tmp_path / "room.mcap", "--duration", "1", "--every-block", every)
+    assert done.code == 2 and "--every-block" in done.err and not list(tmp_path.iterdir())
+
+
 def test_simulate_writes_a_recording_with_truth_that_info_finds_fine(hemislam: Call, tmp_path: Path) -> None:
     made = tmp_path / "room.mcap"
     outcome = hemislam("simulate", "room", "--out", made, "--duration", "2", "--every-block", "30")
