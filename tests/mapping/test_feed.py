@@ -32,14 +32,13 @@ def test_what_is_read_ahead_is_the_same() -> None:
     assert read(SAMPLE, read_ahead=False) == (ahead, "")
 
 
-def test_damage_is_reported_after_the_same_measurements(tmp_path: Path) -> None:
-    damaged = tmp_path / "damaged.mcap"
+def test_a_cut_is_reported_after_the_same_measurements(tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
     whole = SAMPLE.read_bytes()
-    middle = len(whole) // 40
-    damaged.write_bytes(whole[:middle] + b"\xff" * 2000 + whole[middle + 2000 :])
-    ahead, ended = read(damaged, read_ahead=True)
+    cut.write_bytes(whole[: len(whole) // 20])
+    ahead, ended = read(cut, read_ahead=True)
     assert ahead and ended
-    assert read(damaged, read_ahead=False) == (ahead, ended)
+    assert read(cut, read_ahead=False) == (ahead, ended)
 
 
 @pytest.mark.parametrize(("part", "end"), [((2.0, 3.0), 5.0), ((80.0, 60.0), 83.9), ((2.0, None), 83.9)])
