@@ -221,10 +221,12 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
     except CaptureError as error:
         raise HemislamError(f"{path} is not a network capture ({error}); hemislam reads {_KINDS}.") from None
     if not stream.counts:
+        beside = path.with_suffix(".json")
+        unread = " That file is there, but is no metadata of an Ouster; copy it from the sensor again."
         raise HemislamError(
             f"{path} holds no packets of an RS-Bpearl, an Airy or a Mid-360 and no imu-udp datagrams; capture their "
             "UDP ports, usually 6699 and 7788, or 56301 and 56401. Those of an Ouster need its metadata beside them, "
-            f"as {path.stem}.json."
+            f"as {beside.name}.{unread if metadata is None and is_file(beside) else ''}"
         )
     return stream
 

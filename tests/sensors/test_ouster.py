@@ -268,8 +268,11 @@ def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path) -> None:
     path = made("FUSA_RNG15_RFL8_NIR8_DUAL", tmp_path)
     with pytest.raises(HemislamError, match="of a kind that is not read"):
         open_recording(path, Params())
+    (tmp_path / "walk.json").write_text('{"prod_line": "OS-0')
+    with pytest.raises(HemislamError, match=r"is there, but is no metadata of an Ouster; copy it from the sensor"):
+        open_recording(path, Params())
     (tmp_path / "walk.json").unlink()
-    with pytest.raises(HemislamError, match=r"need its metadata beside them, as walk\.json"):
+    with pytest.raises(HemislamError, match=r"need its metadata beside them, as walk\.json\.$"):
         open_recording(path, Params())
     (tmp_path / "walk.osf").write_bytes(b"osf")
     with pytest.raises(HemislamError, match="ouster-cli source"):
