@@ -268,7 +268,9 @@ def _refusal(path: Path, error: Exception) -> str:
         return f"The metadata.yaml of {path} cannot be understood; {_REPAIR[''].format(path=quoted(path))}."
     if "not indexed" in why:
         return f"{path} has no index, as after a recorder that was killed; {_repair(path)}."
-    return f"{path} is cut off or damaged ({why}); {_repair(path)}."
+    inside = _ros2_files(path) if path.is_dir() else []
+    damaged = next((file for file in inside if file.name in str(error)), path)
+    return f"{path} is cut off or damaged ({why}); {_repair(damaged)}."
 
 
 def _recording_files(path: Path) -> list[Path]:

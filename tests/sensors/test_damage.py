@@ -74,6 +74,16 @@ def test_a_damaged_chunk_costs_no_more_than_what_it_held(tmp_path: Path, contain
         assert finding.verdict == "needs you" and finding.text.startswith(said)
 
 
+def test_of_a_folder_of_databases_the_damaged_one_is_to_be_repaired(tmp_path: Path) -> None:
+    """`ros2 bag reindex` cannot repair a database."""
+    for name in ("w_0", "w_1", "w_2"):
+        rig.write(tmp_path / name, rig.walk(turns=9, columns=12), "bare-db3").rename(tmp_path / f"{name}.db3")
+    damaged = tmp_path / "w_1.db3"
+    damaged.write_bytes(damaged.read_bytes()[:-40_000])
+    with pytest.raises(HemislamError, match=rf"`sqlite3 {damaged} \.recover"):
+        open_recording(tmp_path, Params())
+
+
 def test_paths_in_commands_are_written_as_a_shell_takes_them(tmp_path: Path) -> None:
     folder = tmp_path / "Halle (alt)"
     folder.mkdir()
