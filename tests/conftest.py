@@ -1,5 +1,6 @@
 """Shared by all tests: settings, the recordings beside the project, and libraries that a bare machine may lack."""
 
+import fcntl
 import gc
 import os
 import subprocess
@@ -50,6 +51,14 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_xdist_node_collection_finished(node: Any) -> None:
     """Tests begin once the kernels are compiled: else the workers would do it at the same time, each for itself."""
     node.config.stash[compiling].wait()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """One worker after the other: the first leaves its bytecode to the others, which else would all make it."""
+    with Path(__file__).open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return (yield)
 
 
 def pytest_collection_finish() -> None:
