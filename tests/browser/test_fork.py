@@ -18,7 +18,7 @@ from tests.ui.fake_forks import workspace
 @pytest.fixture(scope="module")
 def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
     engine = FakeEngine(columns=120)
-    engine.send(Seek(80))
+    engine.send(Seek(20))
     forks = workspace(engine, tmp_path_factory.mktemp("sessions"), 120)
     yield forks
     forks.close()
@@ -48,8 +48,8 @@ def test_a_fork_is_tuned_seen_swapped_and_kept(bench: Bench, forks: Workspace, t
     page.get_by_role("tab", name="A/B").click()
     before = blue(bench)
     forks.send_other(SetParams({"ground.sigma": 0.1}))
-    forks.send(Seek(140))
-    bench.eventually(lambda: (b := forks.other) is not None and b.transport.frame == 140)
+    forks.send(Seek(80))
+    bench.eventually(lambda: (b := forks.other) is not None and b.transport.frame == 80)
     expect(page.get_by_text("only in A", exact=True).last).to_be_visible()
     if "HEMISLAM_SHOTS" in os.environ:
         page.wait_for_timeout(2500)
