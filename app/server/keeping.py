@@ -81,7 +81,7 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
         case AddNote(text) if text.strip():
             if len(notes) >= MOST_NOTES:
                 raise HemislamError(f"A session holds at most {MOST_NOTES:,} notes; this one was not added.")
-            return replace(kept, notes=(*notes, Note(frame, text.strip())))
+            return replace(kept, notes=(*notes, Note(max(frame, 0), text.strip())))  # -1 before the first frame
         case EditNote(place, before, text) if 0 <= place < len(notes) and notes[place].text == before:
             now = (Note(notes[place].frame, text.strip()),) if text.strip() else ()
             return replace(kept, notes=(*notes[:place], *now, *notes[place + 1 :]))

@@ -153,6 +153,11 @@ def test_a_restart_keeps_the_notes() -> None:
     assert bench.do(Restart()).notes == notes
 
 
+def test_a_note_before_the_first_frame_belongs_to_it() -> None:
+    (note,) = Bench().do(Pause(), Restart(), AddNote("at the start")).notes
+    assert note.frame == 0
+
+
 def test_everything_the_page_draws_arrives() -> None:
     snapshot = Bench().do(Seek(20))
     expected = np.array([fakes.pose(index)[:3, 3] for index in range(21)])
