@@ -46,9 +46,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 their pose of the LiDAR on the IMU, for recordings under other topics. `mid360`: Livox's ROS drivers, with the IMU
 inside the Mid-360 at the place that its manual states. `airy`: RoboSense's ROS driver and the IMU inside, whose axes
 are those of the vendor's examples; each unit states its own pose in DIFOP packets. `jt128`: Hesai's ROS driver; the
-axes agree. `ouster`: Ouster's ROS driver with clouds in `os_lidar`, the IMU's place from one unit's metadata; the doctor
-shows that of a capture's unit. `hesai-xt`, `velodyne`: their ROS drivers; the IMU is your own. `close`: most things are
-at arm's length (a desk, a cabin, a shaft).
+axes agree. `ouster`: Ouster's ROS driver with clouds in `os_lidar`, the IMU's place from one unit's metadata; the
+doctor shows that of a capture's unit. `hesai-xt`, `velodyne`: their ROS drivers; the IMU is your own. `close`: most
+things are at arm's length (a desk, a cabin, a shaft).
 
 `airy` and `jt128` search a quarter of all lines for ground seeds, as the defaults do for the 32 lines of an RS-Bpearl.
 Fewer of such dense lines lie so close together that the lines' own errors tilt the plane."""
