@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.signal import correlate  # type: ignore[attr-defined]  # scipy ships no types
 from scipy.spatial.transform import Rotation, Slerp
 
 from app.evaluation.truth import TruePoses
@@ -208,6 +207,8 @@ def _motion(trajectory: Trajectory, step_s: float, window_s: float, by_rotation:
 
 def _correlations(a: F64, b: F64, least: int) -> tuple[I64, F64]:
     """Pearson correlation of a[i] with b[i - lag] over all values known in both, for every lag."""
+    from scipy.signal import correlate  # type: ignore[attr-defined]  # takes half a second, and most truths need none
+
     known_a, known_b = np.isfinite(a), np.isfinite(b)
     x = np.where(known_a, a - np.nanmean(a), 0.0)
     y = np.where(known_b, b - np.nanmean(b), 0.0)
