@@ -123,7 +123,7 @@ class Recording(AbstractContextManager["Recording"]):
         imu_findings: list[Finding] = []
         if self.imu_topic:
             imu, self._imu_stamped, imu_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
-        self._log_after_stamp_ns = 0
+        self._log_after_stamp_ns = 0  # known below; places of lost messages do not matter to leaps
         self._leaps = self._find_leaps()
         source.first_scan_ns = probes[0].log_ns
         self.start_ns = scans[0].stamp_ns + added_ns(self._leaps.lidar, probes[0].log_ns)
@@ -216,7 +216,7 @@ class Recording(AbstractContextManager["Recording"]):
             after: only entries after this message.
 
         Raises:
-            HemislamError: where the file is damaged.
+            HemislamError: the file cannot be read beyond this place.
         """
         offset, leaps = self._log_after_stamp_ns, self._leaps
         log_first = None if first_ns is None else leaps.recorded_ns(first_ns + offset - LOG_MARGIN_NS)
