@@ -39,7 +39,7 @@ from app.slam.types import I64, DroppedScan, Measurement, Samples, Scan, Vector
 
 SILENCE_S = 0.5
 """A gap without scans at the end, while the IMU continues, is reported if it is longer than this."""
-LOST = "the file is damaged there"
+LOST = "its part of the file is damaged"
 LACKS = "the file is damaged: its index tells of more messages than there are"
 NO_IMU = Finding(
     "IMU topic",

@@ -361,16 +361,23 @@ def test_a_session_that_had_gone_back_still_knows_the_frames_ahead(tmp_path: Pat
     np.testing.assert_array_equal(ahead.series["speed"], as_it_was.series["speed"])
 
 
+class Filling(io.StringIO):
+    """A file whose disk is full once `last` is to be written."""
+
+    def __init__(self, last: str) -> None:
+        super().__init__()
+        self.last = last
+
+    def write(self, text: str) -> int:
+        if self.last in text:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(text)
+
+
 def test_a_disk_that_fills_up_is_reported_once_and_playing_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Full(io.StringIO):
-        def write(self, text: str) -> int:
-            if '"frame": 20' in text:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return super().write(text)
-
-    monkeypatch.setattr(Path, "open", lambda *_, **__: Full())
+    monkeypatch.setattr(Path, "open", lambda *_, **__: Filling('"frame": 20'))
     bench = Bench(session_folder=tmp_path)
     told = [notice.text for notice in bench.do(Seek(40)).notices if "are not saved" in notice.text]
     assert len(told) == 1 and "No space left on device" in told[0]
@@ -382,16 +389,10 @@ def test_a_disk_that_fills_up_is_reported_once_and_playing_goes_on(
 def test_a_disk_that_is_full_when_a_session_is_reopened_is_reported(
     kept: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Full(io.StringIO):
-        def write(self, text: str) -> int:
-            if '"state"' in text:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return super().write(text)
-
     bench = Bench(None, session_folder=kept.parent)
     opened = Path.open
     monkeypatch.setattr(
-        Path, "open", lambda path, mode="r", **how: Full() if mode == "x" else opened(path, mode, **how)
+        Path, "open", lambda path, mode="r", **how: Filling('"state"') if mode == "x" else opened(path, mode, **how)
     )
     told = [notice.text for notice in bench.do(OpenRecording(kept)).notices if "are not saved" in notice.text]
     assert len(told) == 1 and bench.see().session_file is None
