@@ -343,10 +343,9 @@ class Measurements(Iterator[Measurement | DroppedScan]):
                 for entry in recording.entries(first_ns if start_s > 0 else None, stop_ns, self._message):
                     for text in recording.leaps_told(self._message.log_ns, entry.log_ns) if self._message else ():
                         sequencer.notice(text)
-                    before, self._message = self._message, Mark.after(self._message, entry.log_ns)
+                    self._message = Mark.after(self._message, entry.log_ns)
                     if isinstance(entry, LostEntry):
-                        if before is None or before.log_ns != entry.log_ns:  # the messages of a chunk have one time
-                            sequencer.notice(entry.said)
+                        sequencer.notice(entry.said)
                         if entry.scan is not None:
                             sequencer.add_scan(entry.scan)
                     elif isinstance(entry, ScanEntry):

@@ -56,23 +56,25 @@ class RosbagsStream:
             yield printable(connection.topic), log_ns, read_or_lose(self._deserialised, raw, connection.msgtype)
 
     def _raw(self, connections: list[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
-        """(connection, log time ns, bytes). In a bag, those of a chunk that cannot be unpacked have no bytes; for MCAP,
-        see `adapt_rosbags`."""
+        """(connection, log time ns, bytes). In a bag, those of a chunk that cannot be unpacked have no bytes, and the
+        log time of the last message before it; for MCAP, see `adapt_rosbags`."""
+        at_ns = max(start_ns, self.start_ns)
         while True:
+            given = Counter[int]()
             try:
-                for connection, log_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
-                    yield connection, log_ns, raw
-                    start_ns = log_ns + 1
+                for connection, at_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
+                    yield connection, at_ns, raw
+                    given[id(connection)] += 1
                 return
             except Exception as error:  # rosbags lets errors of bz2, lz4, struct and assert pass
                 ends = [chunk.end_time for bag in self._bags() for chunk in bag.chunk_infos]
-                end_ns = min((end for end in ends if end > start_ns), default=0)
+                end_ns = min((end for end in ends if end > max(start_ns, at_ns)), default=0)
                 if not end_ns or isinstance(error, OSError):
                     raise
             for connection in connections:
                 times = (entry.time for entry in connection.owner.indexes[connection.id])
-                lost = sum(start_ns <= log_ns < min(end_ns, stop_ns) for log_ns in times)
-                yield from repeat((connection, max(start_ns, self.start_ns), b""), lost)
+                held = sum(start_ns <= log_ns < min(end_ns, stop_ns) for log_ns in times)
+                yield from repeat((connection, at_ns, b""), held - given[id(connection)])
             start_ns = end_ns
 
     def may_be_disordered(self) -> bool:

@@ -210,8 +210,9 @@ class Sequencer:
             self._count("imu_spikes", "an IMU sample is far from those before and after it and was left out")
 
     def notice(self, text: str) -> None:
-        """Report this text with the next measurement."""
-        self._notices.append(text)
+        """Report this text, once, with the next measurement."""
+        if text not in self._notices:
+            self._notices.append(text)
 
     def add(self, samples: Samples) -> None:
         """Samples of any other sensor. Each goes out once, with the first measurement that ends at or after it.

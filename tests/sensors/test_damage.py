@@ -34,12 +34,13 @@ def test_the_duration_that_a_damaged_file_advises_ends_before_the_damage(tmp_pat
 
 
 def damaged(folder: Path, container: str) -> Path:
-    """A walk of 60 scans and 2.4 s of others, in which a hole of 2000 bytes, or of one message, ends at two thirds."""
-    entries = rig.walk(turns=60, columns=40, ros=1 if "bag" in container else 2)
+    """A walk of 60 scans with a hole of 2000 bytes in the middle, or in a message. Scans are logged with samples."""
+    entries = rig.walk(turns=60, columns=40, ros=1 if "bag" in container else 2, delay_ns=500_000)
     path = rig.write(folder / "walk", entries, container.removesuffix("-cut"))
     if container == "sqlite3-message":
         with sqlite3.connect(next(path.glob("*.db3"))) as database:
-            database.execute("UPDATE messages SET data = x'0102' WHERE id = (SELECT max(id) * 2 / 3 FROM messages)")
+            together = "SELECT max(id) FROM messages GROUP BY timestamp HAVING count(*) = 2 LIMIT 1 OFFSET 30"
+            database.execute(f"UPDATE messages SET data = x'0102' WHERE id = ({together})")
         database.close()
         return path
     content = bytearray(path.read_bytes())
