@@ -346,11 +346,10 @@ class Measurements(Iterator[Measurement | DroppedScan]):
                     self._message = Mark.after(self._message, entry.log_ns)
                     if isinstance(entry, LostEntry):
                         sequencer.notice(entry.said)
-                        if entry.scan is not None:
-                            sequencer.add_scan(entry.scan)
-                    elif isinstance(entry, ScanEntry):
-                        if entry.scan.stamp_ns >= first_ns and (stop_ns is None or entry.scan.stamp_ns < stop_ns):
-                            sequencer.add_scan(entry.scan)
+                    if isinstance(entry, ScanEntry | LostEntry):
+                        scan = entry.scan
+                        if scan and scan.stamp_ns >= first_ns and (stop_ns is None or scan.stamp_ns < stop_ns):
+                            sequencer.add_scan(scan)
                     elif isinstance(entry, OtherEntry):
                         sequencer.add(entry.samples)
                     elif start_s <= 0 or entry.stamp_ns >= first_ns - IMU_BEFORE_NS:

@@ -75,6 +75,18 @@ def test_a_damaged_chunk_costs_no_more_than_what_it_held(tmp_path: Path, contain
         assert finding.verdict == "needs you" and finding.text.startswith(said)
 
 
+@pytest.mark.parametrize("container", ["bag-lz4", "small-chunks"])
+@pytest.mark.parametrize("part", [(4.0, None), (0.0, 2.0)])
+def test_scans_that_damage_took_before_or_after_the_part_that_is_read_are_not_counted(
+    tmp_path: Path, container: str, part: tuple[float, float | None]
+) -> None:
+    """The file is read from some time before the part until some time after it."""
+    with open_recording(damaged(tmp_path, container), Params()) as recording:
+        assert any(isinstance(entry, DroppedScan) for entry in recording.measurements())
+        read = list(recording.measurements(*part))
+    assert len(read) == 20 and all(isinstance(entry, Measurement) for entry in read)
+
+
 def test_of_a_folder_of_databases_the_damaged_one_is_to_be_repaired(tmp_path: Path) -> None:
     """`ros2 bag reindex` cannot repair a database."""
     for name in ("w_0", "w_1", "w_2"):
