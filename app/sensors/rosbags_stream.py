@@ -114,7 +114,7 @@ class RosbagsStream:
             if bag.chunks and bag.chunk_infos[-1].pos == max(bag.chunks):  # rosbags has just read what follows it
                 try:
                     Header.read(bag.bio, RecordType.CONNECTION)
-                except ReaderError:
+                except (ReaderError, ValueError):  # of an unknown kind, or no text
                     return True
         return False
 

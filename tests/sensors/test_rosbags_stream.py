@@ -107,8 +107,13 @@ def one_chunk_too_few(content: bytearray) -> None:
     content[content.index(b"chunk_count=") + 12] -= 1
 
 
+def one_chunk_too_few_of_an_unknown_kind(content: bytearray) -> None:
+    one_chunk_too_few(content)
+    content[content.rindex(b"op=\x05") + 3] = 99
+
+
 @pytest.mark.parametrize("container", ["bag", "bag-lz4"])
-@pytest.mark.parametrize("damage", [one_index_record_too_few, one_chunk_too_few])
+@pytest.mark.parametrize("damage", [one_index_record_too_few, one_chunk_too_few, one_chunk_too_few_of_an_unknown_kind])
 def test_a_bag_whose_index_lists_fewer_messages_than_its_chunks_hold_says_so(
     tmp_path: Path, container: str, damage: Callable[[bytearray], None]
 ) -> None:
