@@ -41,6 +41,7 @@ PATIENCE_S = 120.0
 """How long to wait for the return of a scheduler or of workers that are gone."""
 MOST_DEATHS = 3
 """A job is given up after this many workers died while running it."""
+_NO_WORKERS = "The Dask cluster has no workers; start some with `dask worker ADDRESS --nthreads 1`."
 
 
 class _Gone(Exception):
@@ -63,13 +64,14 @@ def run_on_cluster(jobs: list[Job], *, address: str, url: str = "") -> dict[tupl
     """
     errors: dict[tuple[str, str], str] = {}
     waiting = {job.folder: job for job in jobs if finished(job) is None}
+    deaths = Counter[Path]()
     patient_until, told = -math.inf, ""  # at the start, the cluster must be there
     with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs", disable=None) as bar:
         while waiting:
             try:
                 with _connected(address) as client:
                     patient_until = math.inf
-                    for job, error in _results(client, list(waiting.values()), url):
+                    for job, error in _results(client, list(waiting.values()), url, deaths):
                         del waiting[job.folder]
                         bar.update()
                         if error:
@@ -86,10 +88,14 @@ def run_on_cluster(jobs: list[Job], *, address: str, url: str = "") -> dict[tupl
     return errors
 
 
-def _results(client: Any, jobs: Sequence[Job], url: str) -> Iterator[tuple[Job, str]]:
-    """Yield jobs as they end, with the reason if they failed. Raises _Gone."""
+def _results(client: Any, jobs: Sequence[Job], url: str, deaths: Counter[Path]) -> Iterator[tuple[Job, str]]:
+    """Yield jobs as they end, with the reason if they failed. Raises _Gone.
+
+    Args:
+        deaths: of workers so far, by the folder of the job that they ran; counted on.
+    """
     waiting, running = deque(jobs), dict[str, tuple[Job, Any]]()
-    deaths, news = Counter[Path](), threading.Event()
+    news = threading.Event()
     while waiting or running:
         there = _workers(client)
         for worker in running.keys() - there.keys():
@@ -99,6 +105,8 @@ def _results(client: Any, jobs: Sequence[Job], url: str) -> Iterator[tuple[Job, 
                 yield job, f"{MOST_DEATHS} workers died while running it; they may have too little memory."
             else:
                 waiting.appendleft(job)
+        if not there:
+            raise _Gone(_NO_WORKERS)
         for worker in sorted(there.keys() - running.keys())[: len(waiting)]:
             with contextlib.suppress(_Died):
                 _check(client, worker, there[worker]["nthreads"])
@@ -132,7 +140,8 @@ def _connected(address: str) -> Iterator[Any]:
     try:
         with contextlib.suppress(TimeoutError):
             client.wait_for_workers(1, timeout=CONNECT_S)
-        _workers(client)
+        if not _workers(client):
+            raise _Gone(_NO_WORKERS)
         yield client
     except (CommClosedError, TimeoutError):
         raise _Gone(gone) from None
@@ -166,11 +175,8 @@ def _ask(client: Any, worker: str, function: Callable[..., Any], *about: Any) ->
 
 
 def _workers(client: Any) -> dict[str, Any]:
-    """The scheduler's information on its workers, by address. Raises _Gone: there is none."""
-    workers = dict(client.scheduler_info(n_workers=-1).get("workers", {}))
-    if not workers:
-        raise _Gone("The Dask cluster has no workers; start some with `dask worker ADDRESS --nthreads 1`.")
-    return workers
+    """The scheduler's information on its workers, by address."""
+    return dict(client.scheduler_info(n_workers=-1).get("workers", {}))
 
 
 def _check(client: Any, worker: str, threads: int) -> None:

@@ -8,7 +8,9 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +166,34 @@ def test_a_recording_that_cannot_be_used_costs_its_own_run_only(site: Site, reco
     errors = run_on_cluster([good, bad], address=site.address)
     assert finished(good) is not None
     assert list(errors) == [("walk", "bad")] and "empty.mcap" in errors["walk", "bad"]
+
+
+class Fragile:
+    """A client whose only worker dies of each job, and is back for the next connection."""
+
+    def __init__(self) -> None:
+        self.workers = {"only": {"nthreads": 1}}
+
+    def scheduler_info(self, n_workers: int) -> dict[str, Any]:
+        return {"workers": self.workers}
+
+    def run(self, function: Callable[..., Any], *about: Any, workers: list[str], on_error: str) -> dict[str, Any]:
+        return {workers[0]: function(*about)}
+
+    def submit(self, *_: Any, **__: Any) -> "Future[None]":
+        self.workers = {}
+        return Future()
+
+
+def test_a_job_that_kills_the_only_worker_each_time_is_given_up(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_connected", lambda address: nullcontext(Fragile()))
+    monkeypatch.setattr(cluster, "LOOK_S", 0.01)
+    jobs = [job_of(recording, tmp_path / name) for name in ("first", "again")]
+    errors = run_on_cluster(jobs, address="tcp://nowhere")
+    assert [variant for _, variant in errors] == ["first", "again"]
+    assert all("3 workers died" in error for error in errors.values())
 
 
 def test_no_scheduler_and_other_versions_are_reported_in_a_sentence(
