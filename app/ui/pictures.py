@@ -155,8 +155,8 @@ class PicturesPanel:
             part.replace(file)
             self._saved = file
         except OSError as error:
-            why = error.strerror or error
-            raise HemislamError(f"The flight cannot be written to {file.parent}: {why}; make room there.") from None
+            error.filename = error.filename or str(file.parent)  # a full disk names no file
+            raise
         finally:
             part.unlink(missing_ok=True)
 

@@ -212,7 +212,7 @@ def test_a_flight_that_fills_the_disk_names_its_folder(
     monkeypatch.setattr(zipfile.ZipFile, "writestr", full)
     bench.do(bench.panel._fly)
     (told,) = bench.browser.told
-    assert f"{tmp_path / 'flights'}: No space left on device; make room there" in told
+    assert f"No space left on device ({tmp_path / 'flights'}); check space" in told
     assert list((tmp_path / "flights").iterdir()) == []
 
 
