@@ -63,7 +63,8 @@ def examine(
         except HemislamError as error:
             damage = [Finding(DAMAGE, "needs you", str(error))]
         if census.lost:
-            text = f"{census.lost[0]}; {len(census.lost)} messages in all; the others are used. Copy {path} again"
+            count = len(census.lost)  # without an index, only one of each topic is known of a damaged chunk
+            text = f"{census.lost[0]}; messages lost: at least {count}; all others are used. Copy {path} again"
             damage.insert(0, Finding(DAMAGE, "needs you", text))
         census.take(last=True)
         progress(1.0)

@@ -38,9 +38,9 @@ class Lost:
 
 
 def read_or_lose(read: Callable[..., Any], data: bytes, *kind: str) -> Any:
-    """`read(data, *kind)`, or Lost if it fails. Messages of a chunk that cannot be unpacked come without bytes."""
+    """`read(data, *kind)`, or Lost if it fails. Messages that cannot be unpacked come without bytes."""
     try:
-        return read(data, *kind) if data else Lost("a chunk of messages is not as it was written")
+        return read(data, *kind) if data else Lost("the bytes are not as they were written")
     except Exception as error:  # the libraries let errors of struct, numpy and assert pass
         return Lost(brief(error))
 
