@@ -107,17 +107,21 @@ class Source(AbstractContextManager["Source"]):
 
         Args:
             after: the last message of an earlier call with the same arguments; this call continues from there.
-            lost: give `Lost` for each message that cannot be read; otherwise these are left out.
+            lost: give `Lost` for each message that cannot be read; otherwise these are left out. Those of a damaged
+                chunk are given with the time at which it begins, which may be before `start`.
 
         Raises:
             HemislamError: the file cannot be read beyond this place, where all earlier messages have been given; or
                 all of its messages would be left out.
         """
         first, stop = start_ns or 0, LATEST_NS + 1 if stop_ns is None else stop_ns
-        known = 0
-        if after is not None:
-            known, first = (after.at_log_ns, after.log_ns) if self._stream.by_log_time else (after.read, first)
-        stream = islice(self._stream.messages(topics, first, stop), known, None)
+        if after is None:
+            stream = self._stream.messages(topics, first, stop)
+        elif self._stream.by_log_time:
+            later = self._stream.messages(topics, max(first, after.log_ns), stop)
+            stream = islice((entry for entry in later if entry[1] >= after.log_ns), after.at_log_ns, None)
+        else:
+            stream = islice(self._stream.messages(topics, first, stop), after.read, None)
         log_ns = self.start_ns
         left_out, given = "", lost
         while True:

@@ -97,16 +97,15 @@ def _message_or_nothing(data: bytes) -> bytes:
 def _messages_or_nothing(
     chunk: storage_mcap.ChunkInfo, connections: dict[int, Any], start_ns: int, stop_ns: int, file: Any
 ) -> Iterator[storage_mcap.Msg]:
-    """The messages of a chunk of an MCAP by time; empty ones at its start if the chunk is damaged."""
+    """The messages of a chunk of an MCAP by time; if it is damaged, empty ones at its begin, even before `start_ns`."""
     try:
         yield from _READ_CHUNK(chunk, connections, start_ns, stop_ns, file)
     except OSError:
         raise
     except Exception:  # rosbags lets errors of zstd, lz4 and struct pass; it has not yet given any message then
-        if chunk.message_start_time >= start_ns:
-            for number, connection in connections.items():
-                empty = storage_mcap.Msg(chunk.message_start_time, chunk.chunk_start_offset, connection, b"")
-                yield from repeat(empty, chunk.channel_count.get(number, 0))
+        for number, connection in connections.items():
+            empty = storage_mcap.Msg(chunk.message_start_time, chunk.chunk_start_offset, connection, b"")
+            yield from repeat(empty, chunk.channel_count.get(number, 0))
 
 
 def adapt_rosbags() -> None:

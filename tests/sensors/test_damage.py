@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from app.sensors.doctor import DAMAGE, examine
 from app.sensors.recording import LOST, open_recording
@@ -85,6 +86,30 @@ def test_scans_that_damage_took_before_or_after_the_part_that_is_read_are_not_co
         assert any(isinstance(entry, DroppedScan) for entry in recording.measurements())
         read = list(recording.measurements(*part))
     assert len(read) == 20 and all(isinstance(entry, Measurement) for entry in read)
+
+
+def test_a_part_that_begins_in_the_middle_of_a_damaged_chunk_says_so(tmp_path: Path) -> None:
+    """Chunks of four seconds: this one begins before the messages that are read for the part."""
+    path = rig.write_mcap(tmp_path / "walk.mcap", rig.walk(turns=150, columns=10), chunk_size=250_000)
+    content = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[1]
+    at = chunk.chunk_start_offset + chunk.chunk_length // 2
+    content[at : at + 2000] = bytes(2000)
+    path.write_bytes(content)
+    start_s = (chunk.message_start_time - rig.START_NS) / 1e9 + 3.0
+    with open_recording(path, Params()) as recording:
+        read = list(recording.measurements(start_s))
+        continued, reading = list[Measurement | DroppedScan](), recording.measurements(start_s)
+        while (entry := next(reading, None)) is not None:
+            continued.append(entry)
+            if isinstance(entry, Measurement):
+                reading = recording.measurements(start_s, after=reading.place())
+    first = next(entry for entry in read if isinstance(entry, Measurement))
+    assert first.scan.stamp_ns > rig.START_NS + (start_s + 1.0) * 1e9 and "damaged" in first.notices[0]
+    assert [repr(entry) for entry in continued] == [repr(entry) for entry in read]
 
 
 def test_of_a_folder_of_databases_the_damaged_one_is_to_be_repaired(tmp_path: Path) -> None:
