@@ -2,7 +2,9 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from heapq import merge
 from itertools import chain, islice, pairwise, repeat
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -56,26 +58,11 @@ class RosbagsStream:
             yield printable(connection.topic), log_ns, read_or_lose(self._deserialised, raw, connection.msgtype)
 
     def _raw(self, connections: list[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
-        """(connection, log time ns, bytes). In a bag, those of a chunk that cannot be unpacked have no bytes, and the
-        log time of the last message before it; for MCAP, see `adapt_rosbags`."""
-        at_ns = max(start_ns, self.start_ns)
-        while True:
-            given = Counter[int]()
-            try:
-                for connection, at_ns, raw in self._reader.messages(connections, start=start_ns, stop=stop_ns):
-                    yield connection, at_ns, raw
-                    given[id(connection)] += 1
-                return
-            except Exception as error:  # rosbags lets errors of bz2, lz4, struct and assert pass
-                ends = [chunk.end_time for bag in self._bags() for chunk in bag.chunk_infos]
-                end_ns = min((end for end in ends if end > max(start_ns, at_ns)), default=0)
-                if not end_ns or isinstance(error, OSError):
-                    raise
-            for connection in connections:
-                times = (entry.time for entry in connection.owner.indexes[connection.id])
-                held = sum(start_ns <= log_ns < min(end_ns, stop_ns) for log_ns in times)
-                yield from repeat((connection, at_ns, b""), held - given[id(connection)])
-            start_ns = end_ns
+        """(connection, log time ns, bytes); no bytes of damaged messages, for MCAP as `adapt_rosbags` says."""
+        if self._reader.is2:
+            return self._reader.messages(connections, start=start_ns, stop=stop_ns)
+        bags = [(bag, [one for one in connections if one.owner is bag]) for bag in self._bags()]
+        return merge(*(_messages_of_bag(*bag, start_ns, stop_ns) for bag in bags if bag[1]), key=itemgetter(1))
 
     def may_be_disordered(self) -> bool:
         """Whether chunks of an MCAP step back in time, last too long, or are few and far away; or there are none."""
@@ -174,3 +161,27 @@ def _counted(connections: Iterable[Any]) -> Counter[tuple[str, str, str]]:
     for one in connections:
         counts[one.topic, one.msgtype, str(one.ext)] += one.msgcount
     return counts
+
+
+def _messages_of_bag(bag: Any, connections: list[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
+    """(connection, log time ns, bytes); of a chunk that cannot be unpacked, without bytes and with the log time of the
+    last message before it."""
+    first_ns = min((entry.time for one in connections for entry in bag.indexes[one.id][:1]), default=0)
+    at_ns = max(start_ns, first_ns)
+    while True:
+        given = Counter[int]()
+        try:
+            for connection, at_ns, raw in bag.messages(connections, start_ns, stop_ns):
+                yield connection, at_ns, raw
+                given[id(connection)] += 1
+            return
+        except Exception as error:  # rosbags lets errors of bz2, lz4, struct and assert pass
+            ends = (chunk.end_time for chunk in bag.chunk_infos)
+            end_ns = min((end for end in ends if end > max(start_ns, at_ns)), default=0)
+            if not end_ns or isinstance(error, OSError):
+                raise
+        for connection in connections:
+            times = (entry.time for entry in bag.indexes[connection.id])
+            held = sum(start_ns <= log_ns < min(end_ns, stop_ns) for log_ns in times)
+            yield from repeat((connection, at_ns, b""), held - given[id(connection)])
+        start_ns = end_ns

@@ -112,6 +112,20 @@ def test_a_part_that_begins_in_the_middle_of_a_damaged_chunk_says_so(tmp_path: P
     assert [repr(entry) for entry in continued] == [repr(entry) for entry in read]
 
 
+def test_damage_in_one_bag_of_a_folder_costs_nothing_of_the_others(tmp_path: Path) -> None:
+    entries = rig.walk(turns=40, columns=20, ros=1)
+    for number, part in enumerate((entries[: len(entries) // 2], entries[len(entries) // 2 :])):
+        path = rig.write(tmp_path / f"walk_{number}", part, "bag-lz4")
+    content = bytearray(path.read_bytes())
+    content[6000:6500] = bytes(500)  # in the first chunk
+    path.write_bytes(content)
+    with open_recording(tmp_path, Params()) as recording:
+        used = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
+    assert used[0].scan.stamp_ns < rig.START_NS + rig.PERIOD_NS and len(used) >= 35
+    (said,) = [notice for entry in used for notice in entry.notices if "damaged" in notice]
+    assert "damaged 2.1 s after its start" in said
+
+
 def test_of_a_folder_of_databases_the_damaged_one_is_to_be_repaired(tmp_path: Path) -> None:
     """`ros2 bag reindex` cannot repair a database."""
     for name in ("w_0", "w_1", "w_2"):
