@@ -163,7 +163,7 @@ def _stamp_findings(stamps: list[int], topic: str) -> list[Finding]:
 
 
 def _readable(entries: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
-    """The entries before any damage; reading the recording reports the damage later."""
+    """The entries up to where the file cannot be read any further; reading the recording reports that later."""
     some = False
     try:
         for entry in entries:

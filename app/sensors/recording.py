@@ -308,8 +308,7 @@ class Place:
 class Measurements(Iterator[Measurement | DroppedScan]):
     """A reading of a recording, made by `Recording.measurements`.
 
-    Iterating raises HemislamError at the end if no scan could be used, or, after all that comes
-    before it, at a damaged place in the file.
+    Iterating raises HemislamError at the end if no scan could be used, or where the file cannot be read any further.
     """
 
     def __init__(self, recording: Recording, start_s: float, duration_s: float | None, after: Place | None) -> None:

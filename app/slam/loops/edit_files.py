@@ -118,7 +118,7 @@ def _edit(entry: object) -> LoopEdit:
 
 
 def _values(kind: type[LoopEdit]) -> dict[str, Any]:
-    """What an entry may hold beside its verb, with the defaults; None: it must be given."""
+    """What an entry may hold beside its verb, with the defaults; None where there is none."""
     names = (field for field in fields(kind) if field.name not in ("older", "newer", "what"))
     return {field.name: None if field.default is MISSING else field.default for field in names}
 
