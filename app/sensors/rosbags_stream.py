@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from heapq import merge
+from io import SEEK_CUR, BytesIO
 from itertools import chain, islice, pairwise, repeat
 from operator import itemgetter
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag1.reader import Header, ReaderError, RecordType
+from rosbags.rosbag1.reader import Header, ReaderError, RecordType, read_bytes, read_uint32
 from rosbags.typesys import Stores, get_typestore
 
 from app.sensors.log_times import FAR_NS, FEW, LATEST_NS, SET_BACK_NS, sound_span
@@ -164,24 +165,45 @@ def _counted(connections: Iterable[Any]) -> Counter[tuple[str, str, str]]:
 
 
 def _messages_of_bag(bag: Any, connections: list[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
-    """(connection, log time ns, bytes); of a chunk that cannot be unpacked, without bytes and with the log time of the
-    last message before it."""
-    first_ns = min((entry.time for one in connections for entry in bag.indexes[one.id][:1]), default=0)
-    at_ns = max(start_ns, first_ns)
-    while True:
-        given = Counter[int]()
-        try:
-            for connection, at_ns, raw in bag.messages(connections, start_ns, stop_ns):
-                yield connection, at_ns, raw
-                given[id(connection)] += 1
-            return
-        except Exception as error:  # rosbags lets errors of bz2, lz4, struct and assert pass
-            ends = (chunk.end_time for chunk in bag.chunk_infos)
-            end_ns = min((end for end in ends if end > max(start_ns, at_ns)), default=0)
-            if not end_ns or isinstance(error, OSError):
-                raise
-        for connection in connections:
-            times = (entry.time for entry in bag.indexes[connection.id])
-            held = sum(start_ns <= log_ns < min(end_ns, stop_ns) for log_ns in times)
-            yield from repeat((connection, at_ns, b""), held - given[id(connection)])
-        start_ns = end_ns
+    """(connection, log time ns, bytes), by time; no bytes of damaged messages. Those of a chunk that cannot be unpacked
+    come together when it begins, even before `start_ns`."""
+    at, chunk, lost = -1, None, set[int]()
+    indexes = (zip(bag.indexes[one.id], repeat(one)) for one in connections)
+    for entry, connection in merge(*indexes, key=lambda found: found[0].time):
+        if not start_ns <= entry.time < stop_ns:
+            continue
+        if entry.chunk_pos != at:
+            at, chunk = entry.chunk_pos, _chunk_of_bag(bag, entry.chunk_pos)
+        if chunk is not None:
+            yield connection, entry.time, _record_of_bag(chunk, entry, connection)
+        elif at not in lost:
+            lost.add(at)
+            held = [(one, each.time) for one in connections for each in bag.indexes[one.id] if each.chunk_pos == at]
+            begin_ns = min(time_ns for _, time_ns in held)
+            yield from ((one, begin_ns, b"") for one, _ in held)
+
+
+def _chunk_of_bag(bag: Any, at: int) -> BytesIO | None:
+    """The chunk at this place of the file; None if it cannot be unpacked."""
+    size, begin, unpack = bag.chunks[at]
+    bag.bio.seek(begin)
+    data = bag.bio.read(size)
+    try:
+        return BytesIO(unpack(data))
+    except Exception:  # of bz2 and lz4
+        return None
+
+
+def _record_of_bag(chunk: BytesIO, entry: Any, connection: Any) -> bytes:
+    """The message at a place of the index; empty if there is another record."""
+    chunk.seek(entry.offset)
+    try:
+        head = Header.read(chunk)
+        while head.get_uint8("op") == RecordType.CONNECTION:
+            chunk.seek(read_uint32(chunk), SEEK_CUR)
+            head = Header.read(chunk)
+        message = head.get_uint8("op"), head.get_uint32("conn"), head.get_time("time")
+        data = read_bytes(chunk, read_uint32(chunk))
+    except (ReaderError, ValueError):
+        return b""
+    return data if message == (RecordType.MSGDATA, connection.id, entry.time) else b""

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from rosbags.rosbag1 import Reader
 
 from app.sensors.doctor import DAMAGE, examine
-from app.sensors.recording import LOST, open_recording
+from app.sensors.recording import LOST, LostEntry, open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
@@ -110,6 +111,34 @@ def test_a_part_that_begins_in_the_middle_of_a_damaged_chunk_says_so(tmp_path: P
     first = next(entry for entry in read if isinstance(entry, Measurement))
     assert first.scan.stamp_ns > rig.START_NS + (start_s + 1.0) * 1e9 and "damaged" in first.notices[0]
     assert [repr(entry) for entry in continued] == [repr(entry) for entry in read]
+
+
+@pytest.mark.parametrize("container", ["bag-bz2", "bag-lz4"])
+def test_a_damaged_chunk_of_a_bag_costs_exactly_what_it_held(tmp_path: Path, container: str) -> None:
+    """A scan of the chunk before it is logged together with its first sample."""
+    path = damaged(tmp_path, container)
+    with Reader(path) as bag:
+        at = path.stat().st_size // 2
+        begin_of = {one.pos: bag.chunks[one.pos].datapos for one in bag.chunk_infos}
+        chunk = max((one for one in bag.chunk_infos if begin_of[one.pos] <= at), key=lambda one: one.pos)
+        held = {one.topic: chunk.connection_counts[one.id] for one in bag.connections}
+    with open_recording(path, Params()) as recording:
+        lost = [entry for entry in recording.entries() if isinstance(entry, LostEntry)]
+    assert sum(entry.scan is not None for entry in lost) == held["/points"]
+    assert len(lost) == sum(held.values())
+
+
+def test_a_damaged_record_of_a_bag_costs_one_message(tmp_path: Path) -> None:
+    path = rig.write(tmp_path / "walk", rig.walk(turns=20, columns=20, ros=1), "bag")
+    with Reader(path) as bag:
+        entry = bag.indexes[next(one.id for one in bag.connections if one.topic == "/points")][7]
+        at = bag.chunks[entry.chunk_pos].datapos + entry.offset
+    content = bytearray(path.read_bytes())
+    content[at : at + 4] = b"\xff" * 4  # the length of its header
+    path.write_bytes(content)
+    with open_recording(path, Params()) as recording:
+        (lost,) = [entry for entry in recording.entries() if isinstance(entry, LostEntry)]
+    assert lost.log_ns == entry.time and lost.scan is not None
 
 
 def test_damage_in_one_bag_of_a_folder_costs_nothing_of_the_others(tmp_path: Path) -> None:
