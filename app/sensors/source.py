@@ -122,7 +122,7 @@ class Source(AbstractContextManager["Source"]):
             stream = islice((entry for entry in later if entry[1] >= after.log_ns), after.at_log_ns, None)
         else:
             stream = islice(self._stream.messages(topics, first, stop), after.read, None)
-        log_ns = self.start_ns
+        log_ns = self.start_ns if after is None else after.log_ns
         left_out, given = "", lost
         while True:
             try:
