@@ -232,7 +232,8 @@ class Recording(AbstractContextManager["Recording"]):
             if isinstance(message, Lost):
                 stamp = log_ns + added_ns(self._leaps.log, log_ns) - self._log_after_stamp_ns
                 at_s = (log_ns - self._source.start_ns) / 1e9
-                said = f"the file is damaged {at_s:.1f} s after its start: what was there is lost ({message.why})"
+                # in whole seconds, so that messages of one place have one sentence
+                said = f"the file is damaged {at_s:.0f} s after its start: what was there is lost ({message.why})"
                 yield LostEntry(log_ns, DroppedScan(stamp, LOST) if topic == self.lidar_topic else None, said)
             elif topic == self.lidar_topic:
                 cloud, scan = read_scan(message, log_ns, self._layout)

@@ -165,22 +165,17 @@ def _counted(connections: Iterable[Any]) -> Counter[tuple[str, str, str]]:
 
 
 def _messages_of_bag(bag: Any, connections: list[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
-    """(connection, log time ns, bytes), by time; no bytes of damaged messages. Those of a chunk that cannot be unpacked
-    come together when it begins, even before `start_ns`."""
-    at, chunk, lost = -1, None, set[int]()
+    """(connection, log time ns, bytes), by time; no bytes of messages that are damaged or in a damaged chunk."""
+    at, chunk = -1, None
     indexes = (zip(bag.indexes[one.id], repeat(one)) for one in connections)
     for entry, connection in merge(*indexes, key=lambda found: found[0].time):
-        if not start_ns <= entry.time < stop_ns:
+        if entry.time >= stop_ns:
+            return
+        if entry.time < start_ns:
             continue
         if entry.chunk_pos != at:
             at, chunk = entry.chunk_pos, _chunk_of_bag(bag, entry.chunk_pos)
-        if chunk is not None:
-            yield connection, entry.time, _record_of_bag(chunk, entry, connection)
-        elif at not in lost:
-            lost.add(at)
-            held = [(one, each.time) for one in connections for each in bag.indexes[one.id] if each.chunk_pos == at]
-            begin_ns = min(time_ns for _, time_ns in held)
-            yield from ((one, begin_ns, b"") for one, _ in held)
+        yield connection, entry.time, b"" if chunk is None else _record_of_bag(chunk, entry, connection)
 
 
 def _chunk_of_bag(bag: Any, at: int) -> BytesIO | None:

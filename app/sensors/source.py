@@ -108,7 +108,7 @@ class Source(AbstractContextManager["Source"]):
         Args:
             after: the last message of an earlier call with the same arguments; this call continues from there.
             lost: give `Lost` for each message that cannot be read; otherwise these are left out. Those of a damaged
-                chunk are given with the time at which it begins, which may be before `start`.
+                chunk of an MCAP are given with the time at which it begins, which may be before `start`.
 
         Raises:
             HemislamError: the file cannot be read beyond this place, where all earlier messages have been given; or

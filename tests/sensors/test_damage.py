@@ -70,9 +70,9 @@ def test_a_damaged_chunk_costs_no_more_than_what_it_held(tmp_path: Path, contain
     assert whole - 5 <= len(used) < whole + 1 and set(dropped) <= {LOST}
     assert used[-1].scan.stamp_ns - used[0].scan.stamp_ns > (whole - 3) * rig.PERIOD_NS
     (said,) = [notice for entry in used for notice in entry.notices if "damaged" in notice]
-    at = float(re.findall(r"damaged ([\d.]+) s after its start: what was there is lost \(", said)[0])
+    at = float(re.findall(r"damaged (\d+) s after its start: what was there is lost \(", said)[0])
     gaps = [a for a, b in pairwise(used) if b.scan.stamp_ns - a.scan.stamp_ns > 1.5 * rig.PERIOD_NS]
-    assert not gaps or at == pytest.approx((gaps[0].scan.stamp_ns - rig.START_NS) / 1e9, abs=0.35)
+    assert not gaps or at == pytest.approx((gaps[0].scan.stamp_ns - rig.START_NS) / 1e9, abs=0.8)
     if not container.endswith("-cut"):
         (finding,) = [finding for finding in examine(recording.path, Params()) if finding.subject == DAMAGE]
         assert finding.verdict == "needs you" and finding.text.startswith(f"{said}; messages lost: at least ")
@@ -153,7 +153,7 @@ def test_damage_in_one_bag_of_a_folder_costs_nothing_of_the_others(tmp_path: Pat
         used = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
     assert used[0].scan.stamp_ns < rig.START_NS + rig.PERIOD_NS and len(used) >= 35
     (said,) = [notice for entry in used for notice in entry.notices if "damaged" in notice]
-    assert "damaged 2.1 s after its start" in said
+    assert "damaged 2 s after its start" in said
 
 
 def test_of_a_folder_of_databases_the_damaged_one_is_to_be_repaired(tmp_path: Path) -> None:
