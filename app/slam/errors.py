@@ -1,6 +1,9 @@
 """The one error class whose messages are written for users."""
 
 import shlex
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 LONGEST = 2000
@@ -22,6 +25,17 @@ def refusal(error: OSError) -> str:
     """An error of the operating system, as a sentence."""
     where = f" ({error.filename})" if error.filename else ""
     return f"The system refused: {error.strerror or error}{where}; check space, permissions and limits (ulimit -a)."
+
+
+@contextmanager
+def writing_to(path: Path | None) -> Iterator[None]:
+    """Name the file, or the folder of temporary files if None, in errors of writing, where the system names none."""
+    try:
+        yield
+    except OSError as error:
+        temporary = f"{tempfile.gettempdir()}, for temporary files; TMPDIR chooses another folder"
+        error.filename = error.filename or (temporary if path is None else str(path))
+        raise
 
 
 class HemislamError(Exception):

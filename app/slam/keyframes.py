@@ -13,6 +13,7 @@ from typing import IO
 
 import numpy as np
 
+from app.slam.errors import writing_to
 from app.slam.sections import KeyframeParams
 from app.slam.types import F64, Cloud, Keyframe
 
@@ -61,6 +62,7 @@ class KeyframeStore:
 
     def __init__(self, path: Path | None = None) -> None:
         self._ends = array("q")  # file offset after each keyframe, including later ones after going back
+        self._path = path
         self._file: IO[bytes]
         if path is None:
             self._file = tempfile.TemporaryFile(prefix="hemislam-keyframes-")  # noqa: SIM115 - closed by close()
@@ -122,11 +124,12 @@ class KeyframeStore:
             head[name] = len(cloud) if name == "points" else getattr(keyframe, name)
         begin = self._ends[self._count - 1] if self._count else 0
         end = begin + head.nbytes + len(cloud) * _POINT_BYTES
-        self._file.seek(begin)
-        self._file.write(head.tobytes())
-        for name, column in _COLUMNS.items():
-            self._file.write(np.ascontiguousarray(getattr(cloud, name), column.base).data)
-        self._file.flush()
+        with writing_to(self._path):
+            self._file.seek(begin)
+            self._file.write(head.tobytes())
+            for name, column in _COLUMNS.items():
+                self._file.write(np.ascontiguousarray(getattr(cloud, name), column.base).data)
+            self._file.flush()
         if self._count == len(self._ends) or self._ends[self._count] != end:  # else what follows is still whole
             del self._ends[self._count :]
             self._ends.append(end)

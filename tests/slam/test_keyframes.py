@@ -1,7 +1,10 @@
 """Keyframes: when one is due, and that the store returns exactly the stored data."""
 
+import io
+import tempfile
 import threading
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from app.slam.errors import refusal
 from app.slam.keyframes import KeyframeStore, is_due
+from app.slam.loops.submap import Submaps
 from app.slam.sections import KeyframeParams
 from app.slam.types import Cloud, Keyframe
 
@@ -141,3 +146,12 @@ def test_after_going_back_the_later_ones_can_be_gone_forth_to_until_others_take_
     with pytest.raises(IndexError):
         store.truncate(6)
     store.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_folder_of_temporary_files_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda prefix: io.FileIO("/dev/full", "r+b"))
+    for store in (KeyframeStore(), Submaps(0.1, 20.0, 60.0)):
+        with pytest.raises(OSError, match="No space left") as caught:
+            store.append(keyframe(0))
+        assert f"({tempfile.gettempdir()}, for temporary files; TMPDIR chooses another folder)" in refusal(caught.value)

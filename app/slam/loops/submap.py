@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from app.slam.errors import writing_to
 from app.slam.types import F32, F64, Keyframe
 from app.slam.voxel import VoxelGrid
 
@@ -47,11 +48,12 @@ class Submaps:
 
     def append(self, keyframe: Keyframe) -> None:
         """Take the cloud of the next keyframe."""
-        self._file.seek(self._ends[-1] * _POINT_BYTES)
-        for points in self._level(keyframe):
-            self._file.write(points.tobytes())
-            self._ends.append(self._ends[-1] + len(points))
-        self._file.flush()
+        with writing_to(None):
+            self._file.seek(self._ends[-1] * _POINT_BYTES)
+            for points in self._level(keyframe):
+                self._file.write(points.tobytes())
+                self._ends.append(self._ends[-1] + len(points))
+            self._file.flush()
 
     def truncate(self, count: int) -> None:
         """Forget all clouds but the first `count`."""
