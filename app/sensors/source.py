@@ -4,9 +4,11 @@ import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from app.sensors.findings import Finding
 from app.sensors.live.capture import SUFFIXES as CAPTURES
@@ -191,7 +193,11 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         return reader, (*found, Finding("file", "needs you", text))
     if path.is_dir() and files != [path]:
         if files[0].suffix == ".bag":
-            return reader, (Finding("file", "fine", f"{len(files)} .bag file(s), read as one recording"),)
+            text = f"{len(files)} .bag file(s), read as one recording"
+            numbers = [int(bag.stem.rpartition("_")[2]) for bag in files if len(files) > 1]
+            if skipped := [n for a, b in pairwise(numbers) for n in range(a + 1, b)]:
+                text += f"; number {', '.join(map(str, skipped))} is missing: copy it there, or the map has a gap"
+            return reader, (Finding("file", "needs you" if skipped else "fine", text),)
         text = f"the folder has no metadata.yaml; its {len(files)} {files[0].suffix} file(s) were read without it"
         return reader, (Finding("file", "corrected", text),)
     return reader, found
@@ -209,13 +215,30 @@ def _read_by_rosbags(path: Path, files: list[Path]) -> tuple[RosbagsStream, tupl
     inside = _single_files(path, files)
     with suppress(Exception):
         if inside not in ([], files) and not (bare := RosbagsStream(inside)).is_packed():
-            text = f"the folder's metadata.yaml cannot be used ({why}); its {len(inside)} file(s) were read without it"
             if isinstance(stream, RosbagsStream):
                 stream.close()
+            if missing := _missing(path):
+                return bare, (Finding("file", "needs you", f"{missing}, or the map has a gap"),)
+            text = f"the folder's metadata.yaml cannot be used ({why}); its {len(inside)} file(s) were read without it"
             return bare, (Finding("file", "corrected", text),)
     if isinstance(stream, Exception):
         raise stream
     return stream, ()
+
+
+def _missing(folder: Path) -> str:
+    """Which of the files that a folder's metadata.yaml names are missing, and what to do; "" if none is.
+
+    A file that it does not name is one of them that was renamed.
+    """
+    with suppress(Exception):  # whatever is wrong with it, rosbags says
+        told = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+        named = {Path(name).name for name in told["relative_file_paths"]}
+        there = {path.name for path in folder.iterdir() if path.suffix in (*_MAGIC, *_COMPRESSED)}
+        if there < named:
+            names = ", ".join(sorted(named - there))
+            return f"the folder lacks {names}, which its metadata.yaml names: copy that there"
+    return ""
 
 
 def _open_capture(path: Path) -> CaptureStream | OusterStream:
@@ -268,6 +291,8 @@ def _refusal(path: Path, error: Exception) -> str:
     why = brief(error)
     if isinstance(error, PermissionError):
         return f"{path} cannot be opened (permission denied); change its permissions or copy it."
+    if path.is_dir() and (missing := _missing(path)):
+        return f"{path} is incomplete: {missing}."
     if path.is_dir() and "metadata" in why.lower():
         return f"The metadata.yaml of {path} cannot be understood; {_REPAIR[''].format(path=quoted(path))}."
     if "not indexed" in why:

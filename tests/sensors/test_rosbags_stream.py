@@ -12,6 +12,7 @@ from mcap.writer import IndexType
 
 from app.sensors.doctor import DAMAGE, examine
 from app.sensors.recording import LACKS, open_recording
+from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 from tests.sensors import rig
@@ -79,6 +80,34 @@ def read(folder: Path, container: str, change: Callable[[dict[str, Any]], None])
         used = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
         of_file = [finding.text for finding in recording.findings if finding.subject == "file"]
         return recording.duration_s, len(used), sum(len(entry.imu) for entry in used), of_file
+
+
+@pytest.mark.parametrize("container", ["sqlite3", "sqlite3-message", "sqlite3-file", "mcap"])
+def test_a_file_that_a_folder_lacks_is_named(tmp_path: Path, container: str) -> None:
+    """Files compressed by rosbag2 cannot be read without their metadata.yaml, which tells that they are compressed."""
+    path = rig.write(tmp_path / "walk", rig.walk(turns=30, columns=4), container)
+    told = yaml.safe_load((path / "metadata.yaml").read_text())
+    (there,) = told["rosbag2_bagfile_information"]["relative_file_paths"]
+    gone = f"walk_7{Path(there).suffix}"
+    told["rosbag2_bagfile_information"]["relative_file_paths"] = [there, gone]
+    (path / "metadata.yaml").write_text(yaml.safe_dump(told))
+    said = f"the folder lacks {gone}, which its metadata.yaml names: copy that there"
+    if "-" in container:
+        with pytest.raises(HemislamError, match=f"walk is incomplete: {said}"):
+            open_recording(path, Params())
+    else:
+        with open_recording(path, Params()) as recording:
+            (finding,) = [finding for finding in recording.findings if finding.subject == "file"]
+        assert finding.verdict == "needs you" and finding.text.startswith(said)
+
+
+def test_a_number_that_the_pieces_of_a_bag_lack_is_named(tmp_path: Path) -> None:
+    entries = rig.walk(turns=20, columns=4, ros=1)
+    for number, part in ((0, entries[: len(entries) // 2]), (2, entries[len(entries) // 2 :])):
+        rig.write(tmp_path / f"walk_{number}", part, "bag")
+    with open_recording(tmp_path, Params()) as recording:
+        (finding,) = [finding for finding in recording.findings if finding.subject == "file"]
+    assert finding.verdict == "needs you" and "number 1 is missing: copy it there" in finding.text
 
 
 def test_messages_that_a_damaged_file_has_lost_are_missed(tmp_path: Path) -> None:
