@@ -232,10 +232,13 @@ class OusterStream(PacketStream):
             found.append(Finding("IMU", "needs you", missed))
         self.findings = tuple(found)
 
-    def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[bytes | list[bytes]]:
+    def _contents(self, datagrams: Iterator[tuple[int, Datagram | None]]) -> Iterator[bytes | list[bytes]]:
         meta = self._metadata
         turns = Turns(meta.width // meta.columns)
         for _, datagram in datagrams:
+            if datagram is None:
+                yield from turns.rest()
+                continue
             payload = datagram.payload
             if self._is_of_another(datagram):
                 continue

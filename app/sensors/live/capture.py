@@ -43,6 +43,8 @@ _RUN_IN = 2
 """Reading begins at the place where the scan this many earlier was complete, which is before all packets of the wanted
 scan."""
 
+_SILENCE_NS = 1_000_000_000
+"""Packets wait this long for the rest of their scan, as live ones."""
 _WILD_NS = 10_000_000_000
 """A log time that is farther than this from those around it is wrong."""
 
@@ -95,8 +97,11 @@ class PacketStream(ABC):
         return
 
     @abstractmethod
-    def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[Any]:
-        """The contents that these datagrams complete. datagrams: each with its log time, which never steps back."""
+    def _contents(self, datagrams: Iterator[tuple[int, Datagram | None]]) -> Iterator[Any]:
+        """The contents that these datagrams complete.
+
+        datagrams: each with its log time, which never steps back; None after the last one before a silence.
+        """
 
     @abstractmethod
     def _message(self, content: Any, log_ns: int) -> Any:
@@ -120,9 +125,11 @@ class PacketStream(ABC):
         """
         at = place or CapturePlace(0)
 
-        def datagrams() -> Iterator[tuple[int, Datagram]]:
+        def datagrams() -> Iterator[tuple[int, Datagram | None]]:
             nonlocal at, running_ns
             for time_ns, datagram in _without_wild_times(self._capture.datagrams(place), running_ns):
+                if time_ns - running_ns > _SILENCE_NS:
+                    yield running_ns, None
                 at, running_ns = datagram.place, max(running_ns, time_ns)
                 yield running_ns, datagram
 
@@ -199,10 +206,15 @@ class CaptureStream(PacketStream):
             return ros.cloud_message(replace(scan, stamp_ns=stamp_ns), exact=True)
         return ros.empty_cloud(stamp_ns)
 
-    def _contents(self, datagrams: Iterator[tuple[int, Datagram]]) -> Iterator[Revolution | ImuSample | Difop]:
+    def _contents(self, datagrams: Iterator[tuple[int, Datagram | None]]) -> Iterator[Revolution | ImuSample | Difop]:
         counters = self._counters = Counters()
         assembler, order, model = Assembler(counters, self._device.models), ImuOrder(counters), self._device.model
         for log_ns, datagram in datagrams:
+            if datagram is None or log_ns - (assembler.pending_since() or log_ns) > _SILENCE_NS:
+                yield from assembler.flush()
+            if datagram is None:
+                yield from order.flush()
+                continue
             payload = datagram.payload
             beside = payload.startswith(IMU_MAGIC)
             if not beside and self._sender is not None and self._is_of_another(datagram):
@@ -234,12 +246,12 @@ class CaptureStream(PacketStream):
                 if not self._devices or not content.same(self._devices[-1][1]):
                     self._devices.append((log_ns, content))
             elif isinstance(content, Revolution):
-                lidar.extend((int(content.stamps_ns[-1]), log_ns))
+                lidar.extend((int(content.stamps_ns[-1]), content.arrival_ns, log_ns))
                 self._model = content.model.name
             else:
-                of_imus[self._beside].extend((content.stamp_ns, log_ns))
+                of_imus[self._beside].extend((content.stamp_ns, log_ns, log_ns))
         imu = of_imus[self._beside]
-        frames, samples = np.array(lidar, np.int64).reshape(-1, 2), np.array(imu, np.int64).reshape(-1, 2)
+        frames, samples = np.array(lidar, np.int64).reshape(-1, 3), np.array(imu, np.int64).reshape(-1, 3)
         of_topics = ((self._lidar_topic, self._device.layout.kind, frames), (self._imu_topic, ros.IMU, samples))
         self.counts = {topic: (kind, len(rows)) for topic, kind, rows in of_topics if len(rows)}
         self._settle_clocks(frames, samples)
@@ -248,18 +260,18 @@ class CaptureStream(PacketStream):
         """Use the sensors' own clocks if they agree, else the host's clock; remove steps of a clock.
 
         Args:
-            frames, samples: (n, 2) stamp and log time.
+            frames, samples: (n, 3) stamp, when the last packet came, and log time.
         """
         delays = [np.median(part[:_COMPARED, 1] - part[:_COMPARED, 0]) / 1e9 for part in (frames, samples) if len(part)]
         self._apart_s = float(delays[1] - delays[0]) if len(delays) == 2 else 0.0
         self._host = abs(self._apart_s) > TOLERANCE_S
         lidar, imu = ClockMap(self._host), ClockMap(self._host)
         self._lidar_shifts: Shifts = []
-        for stamp, log_ns in frames.tolist():
-            self._lidar_shifts.append((log_ns, lidar.map(stamp, log_ns) - stamp))
+        for stamp, arrival_ns, log_ns in frames.tolist():
+            self._lidar_shifts.append((log_ns, lidar.map(stamp, arrival_ns) - stamp))
         self._imu_shifts: Shifts = []
         following = [*samples[1:, 0].tolist(), None]
-        for (stamp, log_ns), after in zip(samples.tolist(), following, strict=False):
+        for (stamp, _, log_ns), after in zip(samples.tolist(), following, strict=False):
             if imu.jumps(stamp, log_ns) and (after is None or abs(after - stamp) > JUMP_NS):
                 continue  # a single wrong stamp, not a clock that was set
             shift = imu.map(stamp, log_ns, lidar) - stamp

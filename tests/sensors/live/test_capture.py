@@ -204,6 +204,31 @@ def test_a_clock_set_on_the_way_does_not_end_the_recording(tmp_path: Path) -> No
     assert len(measurements(path)) == TURNS
 
 
+@pytest.mark.parametrize("imu_goes_on", [True, False])
+def test_a_silence_within_a_revolution_is_no_clock_that_was_set(tmp_path: Path, imu_goes_on: bool) -> None:
+    """As when a cable comes off. What is left of the revolution is not logged when the next one comes."""
+    begins_ns = [sensor.START_NS, sensor.START_NS + 4_000_000_000]
+    lidar = [sensor.turns(20, start_ns=begin_ns) for begin_ns in begins_ns]
+    per_turn, block_ns = len(lidar[0]) / 20, 12 * 55_520
+    lidar[0] = lidar[0][: round(12.5 * per_turn)]
+    entries = [
+        (begin_ns + (k + 1) * block_ns, 6699, packet)
+        for begin_ns, packets in zip(begins_ns, lidar, strict=True)
+        for k, packet in enumerate(packets)
+    ]
+    for number in range(1200):
+        stamp = sensor.START_NS + number * 5_000_000
+        if imu_goes_on or not len(lidar[0]) * block_ns < stamp - sensor.START_NS < 4_000_000_000:
+            entries.append((stamp + 300_000, 6700, imu(number, stamp)))
+    path = tmp_path / "walk.pcap"
+    path.write_bytes(captures.pcap(sorted(entries)))
+    with open_recording(path, Params()) as recording:
+        assert not {"sensor clocks", "clock leap"} & {finding.subject for finding in recording.findings}
+        stamps = [m.scan.stamp_ns for m in recording.measurements() if isinstance(m, Measurement)]
+    expected = [begins_ns[0] + k * TURN_NS for k in range(13)] + [begins_ns[1] + k * TURN_NS for k in range(20)]
+    np.testing.assert_allclose(np.array(stamps) - sensor.START_NS, np.array(expected) - sensor.START_NS, atol=1_000)
+
+
 @pytest.mark.parametrize("at", [0, 1, 500, -1])
 @pytest.mark.parametrize("wild_ns", [1_000_000_000, 2_208_988_800_000_000_000])
 def test_a_single_wild_log_time_spoils_no_other(tmp_path: Path, at: int, wild_ns: int) -> None:
