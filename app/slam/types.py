@@ -59,7 +59,14 @@ class Scan:
     refused: int = 0
 
     def __post_init__(self) -> None:
-        for array in (self.points, self.offsets_ns, self.intensity, self.ring, self.truth_ground):
+        columns = (self.offsets_ns, self.intensity, self.ring, self.truth_ground)
+        shapes = [array.shape for array in (self.points, *columns) if array is not None]
+        count = len(self.points)
+        if shapes != [(count, 3), *[(count,)] * (len(shapes) - 1)]:  # the kernels do not look
+            raise ValueError(
+                f"a scan has points (n, 3), and offsets_ns, intensity and ring (n,), but these are {shapes}"
+            )
+        for array in (self.points, *columns):
             if array is not None:
                 array.setflags(write=False)
 
@@ -103,6 +110,11 @@ class ImuSamples(Samples):
 
     gyro: F64
     accel: F64
+
+    def __post_init__(self) -> None:
+        shapes = [array.shape for array in (self.gyro, self.accel, self.stamps_ns)]
+        if shapes != [(len(self), 3), (len(self), 3), (len(self),)]:
+            raise ValueError(f"IMU samples have gyro (k, 3), accel (k, 3) and stamps_ns (k,), but these are {shapes}")
 
     def part(self, which: Mask | slice) -> "ImuSamples":
         """Some of them, by a mask or a slice."""

@@ -81,11 +81,7 @@ def test_the_stated_uncertainty_is_that_of_the_errors() -> None:
 
 def test_a_line_that_sees_nothing_stays_as_it_is() -> None:
     excerpt, track = walk_in_a_room(np.full(COUNT, 0.0), 0.02 * np.cos(np.pi * np.arange(COUNT)))
-    blind = [scan.ring < COUNT - 1 for scan in excerpt.scans]
-    scans = [
-        replace(scan, points=scan.points[seen], ring=scan.ring[seen])
-        for scan, seen in zip(excerpt.scans, blind, strict=True)
-    ]
+    scans = [scan.part(scan.ring < COUNT - 1) for scan in excerpt.scans]
     track = replace(track, points=tuple(scan.points for scan in scans))
     found = fit_lines(replace(excerpt, scans=tuple(scans)), track, Lines.none(COUNT))
     assert np.isnan(found.after[-1]) and abs(found.ranges[-1]) < 1e-6

@@ -36,6 +36,18 @@ def first_points(scan: Scan, count: int) -> Scan:
     return only(scan, np.arange(len(scan)) < count)
 
 
+@pytest.mark.parametrize("name", ["points", "offsets_ns", "intensity", "ring", "truth_ground", "gyro", "stamps_ns"])
+def test_arrays_of_different_lengths_are_refused(name: str) -> None:
+    """As if returns without a range were left out of the points alone; the kernels would read beyond the others."""
+    rows = {"points": (7, 3), "offsets_ns": 7, "intensity": 7, "ring": 7, "truth_ground": 7}
+    samples = {"stamps_ns": 7, "gyro": (7, 3), "accel": (7, 3)}
+    whole, make = (rows, lambda **of: Scan(0, **of)) if name in rows else (samples, ImuSamples)
+    arrays = {column: np.ones(shape, np.float32) for column, shape in whole.items()}
+    assert len(make(**arrays)) == 7
+    with pytest.raises(ValueError, match=r"\(6,"):
+        make(**arrays | {name: arrays[name][:-1]})
+
+
 @pytest.mark.parametrize("count", [0, 5])
 def test_lost_without_points_and_found_again(count: int) -> None:
     """A second with a hand over the sensor."""

@@ -104,8 +104,8 @@ def test_what_was_seen_from_afar_is_known_underfoot() -> None:
     for height, expected in ((-HEIGHT, True), (-HEIGHT + 0.2, False)):
         probe = np.column_stack([xy, np.full(200, height)]).astype(np.float32)
         points = np.concatenate([probe, scan.points])
-        ring = np.zeros(len(points), np.uint16)
-        labels = segment(replace(scan, points=points, ring=ring), at(20.0), result.floor, GroundParams(alpha=1)).labels
+        probed = Scan(0, points, *(np.zeros(len(points), kind) for kind in (np.int32, np.float32, np.uint16)))
+        labels = segment(probed, at(20.0), result.floor, GroundParams(alpha=1)).labels
         assert ((labels[:200] != NON_GROUND).mean() > 0.95) == expected
 
 
