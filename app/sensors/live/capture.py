@@ -262,9 +262,22 @@ class CaptureStream(PacketStream):
         Args:
             frames, samples: (n, 3) stamp, when the last packet came, and log time.
         """
-        delays = [np.median(part[:_COMPARED, 1] - part[:_COMPARED, 0]) / 1e9 for part in (frames, samples) if len(part)]
-        self._apart_s = float(delays[1] - delays[0]) if len(delays) == 2 else 0.0
-        self._host = abs(self._apart_s) > TOLERANCE_S
+        self._host, self._apart_s = False, 0.0
+        self._take_out_steps(frames, samples)
+        if len(frames) and len(samples):  # a clock that was set on the way is compared as it goes on
+            ages = [
+                np.median(
+                    [at_ns - stamp - _value_at(shifts, log_ns) for stamp, at_ns, log_ns in part[:_COMPARED].tolist()]
+                )
+                for part, shifts in ((frames, self._lidar_shifts), (samples, self._imu_shifts))
+            ]
+            self._apart_s = float(ages[1] - ages[0]) / 1e9
+        if abs(self._apart_s) > TOLERANCE_S:
+            self._host = True
+            self._take_out_steps(frames, samples)
+
+    def _take_out_steps(self, frames: I64, samples: I64) -> None:
+        """Find what is added to stamps so that no clock is set on the way; arguments as above."""
         lidar, imu = ClockMap(self._host), ClockMap(self._host)
         self._lidar_shifts: Shifts = []
         for stamp, arrival_ns, log_ns in frames.tolist():

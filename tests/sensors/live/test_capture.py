@@ -204,6 +204,19 @@ def test_a_clock_set_on_the_way_does_not_end_the_recording(tmp_path: Path) -> No
     assert len(measurements(path)) == TURNS
 
 
+def test_a_lidar_that_finds_its_time_server_on_the_way_belongs_to_its_imu_before_and_after(tmp_path: Path) -> None:
+    block_ns, boot_ns = 12 * 55_520, sensor.START_NS - 26 * 365 * 86_400 * 10**9
+    packets = [*sensor.turns(2, start_ns=boot_ns), *sensor.turns(4, start_ns=sensor.START_NS + 2 * TURN_NS)]
+    entries = [(sensor.START_NS + (k + 1) * block_ns, 6699, packet) for k, packet in enumerate(packets)]
+    path = tmp_path / "walk.pcap"
+    path.write_bytes(captures.pcap(sorted([*entries, *(entry for entry in walk() if entry[1] == 6700)])))
+    found = measurements(path)
+    assert len(found) >= 4
+    for m in found:
+        turn = round((m.scan.stamp_ns - sensor.START_NS) / TURN_NS)
+        assert m.scan.stamp_ns == pytest.approx(sensor.START_NS + turn * TURN_NS, abs=5e6)
+
+
 @pytest.mark.parametrize("imu_goes_on", [True, False])
 def test_a_silence_within_a_revolution_is_no_clock_that_was_set(tmp_path: Path, imu_goes_on: bool) -> None:
     """As when a cable comes off. What is left of the revolution is not logged when the next one comes."""
