@@ -24,6 +24,12 @@ def clock_finding(scans: I64, imu: I64, applied_s: float) -> Finding:
     """
     if not len(scans) or not len(imu):
         return Finding("clocks", "needs you", "there are no scans and IMU samples to compare")
+    if _stands_still(scans) and _stands_still(imu):
+        text = (
+            "all messages were logged at about the same time, which shows neither whether the two clocks agree nor "
+            "where a start and a duration in seconds lie; write the recording with log times"
+        )
+        return Finding("clocks", "needs you", text)
     spread = _offset_spread_s(scans, imu)
     if spread > TOLERANCE_S:
         text = (
@@ -76,6 +82,11 @@ def _offset_spread_s(scans: I64, imu: I64, parts: int = 10) -> float:
         if len(some_scans) and len(some_imu):
             offsets.append(_offset_s(some_scans, some_imu))
     return max(offsets) - min(offsets) if offsets else 0.0
+
+
+def _stands_still(times: I64) -> bool:
+    """Whether the log times, the first column, do not advance with the stamps, the last one."""
+    return bool(np.ptp(times[:, 0]) < 0.1 * np.ptp(times[:, -1]))
 
 
 def _copied(times: I64) -> bool:

@@ -97,3 +97,18 @@ def test_pauses_and_clocks_that_are_set_are_not_wild() -> None:
     ):
         assert log_times.mended(times) == {}
         assert log_times.sound_span(times) == (times.min(), times.max() + 1, 0)
+
+
+@pytest.mark.parametrize("container", ["small-chunks", "bag", "bare-db3"])
+@pytest.mark.parametrize("log_ns", [0, rig.START_NS])
+def test_log_times_that_stand_still_are_taken_for_no_clock(tmp_path: Path, container: str, log_ns: int) -> None:
+    """As a program leaves them that writes every message with one log time."""
+    entries = [(topic, log_ns, message) for topic, _, message in walk([], 1 if container == "bag" else 2)]
+    path = rig.write(tmp_path / "walk", entries, container)
+    with open_recording(path, Params()) as recording:
+        (finding,) = [finding for finding in recording.findings if finding.subject == "clocks"]
+        used = [entry for entry in recording.measurements() if isinstance(entry, Measurement)]
+    assert (
+        finding.verdict == "needs you" and not finding.option and "write the recording with log times" in finding.text
+    )
+    assert len(used) == TURNS
