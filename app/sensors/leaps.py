@@ -89,16 +89,19 @@ def find_leaps(
             continue
         done_ns = after_ns + AROUND_NS
         steps = [_greatest_steps(times, before_ns, after_ns) for times in topics]
-        (of_scans, log_of_scans), (of_samples, log) = steps[0], steps[-1]
+        log_ns = min((log.by_ns for _, log in steps), key=abs)
+        # what a topic was silent for beyond the other one, as while its sensor started anew, is no leap
+        (of_scans, log_of_scans), *_ = steps = [(_without(own, log.by_ns - log_ns), log) for own, log in steps]
+        of_samples, log = steps[-1]
         # what is the same in all is due to messages that were lost meanwhile
-        lost_ns = min((of_scans.by_ns, of_samples.by_ns, log.by_ns), key=abs)
+        lost_ns = min((of_scans.by_ns, of_samples.by_ns, log_ns), key=abs)
         if abs(lost_ns) < JITTER_NS or (lost_ns > AROUND_NS and continues(before_ns, after_ns)):
             lost_ns = 0
         same = abs(of_scans.by_ns - of_samples.by_ns) < JITTER_NS
         for leaps, at_ns, by_ns in (
             (of_lidar, of_scans.at_ns, of_scans.by_ns),
             (of_imu, of_samples.at_ns, of_scans.by_ns if same else of_samples.by_ns),
-            (of_log, min(log.at_ns, log_of_scans.at_ns), log.by_ns),
+            (of_log, min(log.at_ns, log_of_scans.at_ns), log_ns),
         ):
             if abs(by_ns - lost_ns) > LEAST_NS:
                 leaps.append(Leap(at_ns, by_ns - lost_ns))
@@ -108,6 +111,11 @@ def find_leaps(
             leaps = of_lidar or of_imu
             leaps.append(Leap(END_NS, -sum(leap.by_ns for leap in leaps)))
     return Leaps(tuple(of_lidar), tuple(of_imu), tuple(of_log))
+
+
+def _without(leap: Leap, silence_ns: int) -> Leap:
+    """The leap of stamps without what passed in a silence; less may be a delay of logging."""
+    return Leap(leap.at_ns, leap.by_ns - silence_ns) if silence_ns > LEAST_NS else leap
 
 
 def _apart(topics: list[Times], first_ns: int, end_ns: int) -> int:

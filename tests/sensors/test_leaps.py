@@ -81,6 +81,29 @@ def test_time_goes_on_where_a_clock_is_set(
     assert {finding.subject for finding in wrong} == {"mount", "rotation"}  # of so few points
 
 
+@pytest.mark.parametrize(("silent", "name"), [("/points", "LiDAR"), ("/imu", "IMU")])
+def test_a_sensor_that_starts_anew_while_the_other_goes_on_was_silent_meanwhile(
+    tmp_path: Path, silent: str, name: str
+) -> None:
+    """Its clock then begins at zero. What passed meanwhile is known by the recorder."""
+    layout = rig.Layout(absolute=False, fields=rig.RELATIVE, header="first")
+    back_ns, entries = LEAPS_AT_NS + 3 * S, []
+    for topic, log_ns, sent in rig.walk(TURNS, layout, columns=4):
+        begin_ns = log_ns - (500_000 if topic == "/imu" else rig.PERIOD_NS + 3_000_000)
+        if topic == silent and begin_ns >= LEAPS_AT_NS:
+            if begin_ns < back_ns:
+                continue
+            sent.header = rig.header(begin_ns - back_ns, 2)
+        entries.append((topic, log_ns, sent))
+    with open_recording(rig.write(tmp_path / "walk", entries, "small-chunks"), Params()) as recording:
+        (leap,) = [finding for finding in recording.findings if finding.subject == "clock leap"]
+        used = [entry.scan for entry in recording.measurements() if isinstance(entry, Measurement)]
+    assert f"the times of the {name} leap by {-back_ns / S:.3f} s;" in leap.text
+    begins = [(scan.stamp_ns - used[0].stamp_ns) / rig.PERIOD_NS for scan in used]
+    expected = [n for n in range(TURNS) if silent == "/imu" or not 120 <= n < 150]
+    assert begins == pytest.approx(expected, abs=0.05)
+
+
 def test_a_clock_may_be_set_twice(tmp_path: Path) -> None:
     def twice(now: int) -> int:
         return since_power_on(now) - (2 * S if now >= LEAPS_AT_NS + 5 * S else 0)
