@@ -19,6 +19,9 @@ FLUSH_S = 0.5
 MAX_SCANS, MAX_SAMPLES = 200, 100_000
 """Most messages that wait for the disk: 20 s of scans. If the disk is too slow, the newest are left out."""
 
+LATE_NS = 2_000_000_000
+"""A scan whose rest is awaited in vain is written after IMU samples that came up to this much later."""
+
 
 class Recorder:
     """Attributes:
@@ -42,6 +45,7 @@ class Recorder:
                 raise HemislamError(f"{path} is there already; record into another file.") from None
             raise HemislamError(f"{path} cannot be written ({error.strerror}); choose another place.") from None
         self._mcap = RecordingWriter(self._file)
+        self._log_ns = 0
         self._waiting: deque[ScanEntry | ImuEntry] = deque()
         self._scans_waiting = 0
         self._wake = threading.Event()
@@ -88,9 +92,11 @@ class Recorder:
             self._waiting.clear()
 
     def _write(self, entry: ScanEntry | ImuEntry) -> None:
+        waited = 0 < self._log_ns - entry.log_ns < LATE_NS  # more is a clock that was set back
+        self._log_ns = self._log_ns if waited else entry.log_ns
         if isinstance(entry, ImuEntry):
-            self._mcap.add_imu(entry.stamp_ns, entry.gyro, entry.accel, entry.log_ns)
+            self._mcap.add_imu(entry.stamp_ns, entry.gyro, entry.accel, self._log_ns)
             return
         self._scans_waiting -= 1
         if isinstance(entry.scan, Scan):
-            self._mcap.add_scan(entry.scan, entry.log_ns)
+            self._mcap.add_scan(entry.scan, self._log_ns)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Chunk, MessageIndex
+from mcap.records import Chunk, Message, MessageIndex
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -41,11 +41,16 @@ def scan(turn: int) -> Scan:
     return Scan(begin, points.astype(np.float32), offsets, rng.integers(0, 256, 900).astype(np.float32), ring)
 
 
-def record(recorder: Recorder, turns: range) -> None:
+def record_samples(recorder: Recorder, turns: range) -> None:
     for turn in turns:
         for k in range(20):
             stamp = sensor.START_NS + turn * TURN_NS + k * 5_000_000
             recorder.add(ImuEntry(stamp + 1_000_000, stamp, (0.1, 0.2, 0.001 * k), (0.0, 0.0, 9.81)))
+
+
+def record(recorder: Recorder, turns: range) -> None:
+    for turn in turns:
+        record_samples(recorder, range(turn, turn + 1))
         recorder.add(ScanEntry(sensor.START_NS + (turn + 1) * TURN_NS + 3_000_000, None, scan(turn)))
 
 
@@ -73,6 +78,20 @@ def test_a_session_reads_again_as_it_was(tmp_path: Path) -> None:
         types = {connection.topic: connection.msgtype for connection in reader.connections}
         assert types == {"/rslidar_points": "sensor_msgs/msg/PointCloud2", "/imu/data": "sensor_msgs/msg/Imu"}
         assert reader.message_count == 12 * 21
+
+
+def test_a_scan_that_waited_for_its_rest_leaves_log_times_in_order(tmp_path: Path) -> None:
+    """The last one before the LiDAR falls silent is given a second late, with the time at which its packets came."""
+    recorder = Recorder(tmp_path / "session.mcap")
+    record(recorder, range(12))
+    record_samples(recorder, range(12, 23))
+    recorder.add(ScanEntry(sensor.START_NS + 13 * TURN_NS, None, scan(12)))
+    record_samples(recorder, range(23, 40))
+    record(recorder, range(40, 50))
+    recorder.close()
+    with recorder.path.open("rb") as file:
+        logged = [record.log_time for record in StreamReader(file).records if isinstance(record, Message)]
+    assert logged == sorted(logged) and len(scans(recorder.path)) == 23
 
 
 @pytest.mark.parametrize("imu_from", [None, 13])
