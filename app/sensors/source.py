@@ -17,7 +17,7 @@ from app.sensors.live.pcap import CaptureError
 from app.sensors.log_times import LATEST_NS
 from app.sensors.mcap_stream import McapStream
 from app.sensors.ouster import OusterStream, metadata_beside
-from app.sensors.ros import Lost, brief
+from app.sensors.ros import IMU, Lost, brief
 from app.sensors.rosbags_stream import RosbagsStream
 from app.slam.errors import HemislamError, quoted
 from app.slam.text_files import is_file
@@ -247,6 +247,10 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
         stream = CaptureStream(path) if metadata is None else OusterStream(path, metadata)
     except CaptureError as error:
         raise HemislamError(f"{path} is not a network capture ({error}); hemislam reads {_KINDS}.") from None
+    if stream.shortened and all(kind == IMU for kind, _ in stream.counts.values()):
+        raise HemislamError(
+            f"{path} holds only the begin of each packet; capture them whole, as `tcpdump -s 0 -w walk.pcap` does."
+        )
     if not stream.counts:
         beside = path.with_suffix(".json")
         unread = " That file is there, but is no metadata of an Ouster; copy it from the sensor again."

@@ -63,7 +63,8 @@ class PacketStream(ABC):
             other types give no messages.
 
     Attributes:
-        complete: whether the file has its end. findings: the kinds of packets, and how many were lost.
+        complete: whether the file has its end. shortened: whether packets were not captured whole.
+        findings: the kinds of packets, and how many were lost.
     """
 
     by_log_time, wild = True, 0
@@ -116,7 +117,7 @@ class PacketStream(ABC):
             if isinstance(content, scans):
                 self._complete_at.append((log_ns, place))
             yield log_ns, content
-        self.complete = self._capture.complete
+        self.complete, self.shortened = self._capture.complete, self._capture.shortened
 
     def _read(self, place: CapturePlace | None, running_ns: int) -> Iterator[tuple[int, CapturePlace, Any]]:
         """Log time, place in the file, and the content that was complete there; from a place on, or all.

@@ -65,12 +65,13 @@ class Capture:
 
     Attributes:
         complete: False once the end was found to be in the middle of a frame.
+        shortened: True once a frame was found of which only the begin was captured.
     """
 
     def __init__(self, path: Path) -> None:
         """Raises CaptureError: not a capture."""
         self._path = path
-        self.complete = True
+        self.complete, self.shortened = True, False
         with path.open("rb") as file:
             start = file.read(24)
         self._frames, self._start = self._next_frames, CapturePlace(0)
@@ -104,7 +105,8 @@ class Capture:
         (interface,) = place.interfaces
         while file.peek(1):
             position = file.tell()
-            seconds, fraction, length, _ = struct.unpack(place.order + "4I", _taken(file, 16))
+            seconds, fraction, length, original = struct.unpack(place.order + "4I", _taken(file, 16))
+            self.shortened |= length < original
             data = _taken(file, length)
             time_ns = seconds * 1_000_000_000 + fraction * 1_000_000_000 // interface.units
             yield CapturePlace(position, place.order, place.interfaces), time_ns, interface.link, data
@@ -124,7 +126,8 @@ class Capture:
             if kind == 1 and len(body) >= 12 and len(interfaces) < _MOST_INTERFACES:
                 interfaces = (*interfaces, _interface(body, order))
             elif kind == 6 and len(body) >= 24:
-                number, high, low, captured, _ = struct.unpack_from(order + "5I", body)
+                number, high, low, captured, original = struct.unpack_from(order + "5I", body)
+                self.shortened |= captured < original
                 if number < len(interfaces):
                     interface = interfaces[number]
                     time_ns = (high << 32 | low) * 1_000_000_000 // interface.units + interface.offset_ns

@@ -63,8 +63,9 @@ def pcap(
     order: str = "<",
     nanoseconds: bool = True,
     others: Iterable[Entry] = (),
+    most: int = 65535,
 ) -> bytes:
-    """others: sent by another host."""
+    """others: sent by another host. most: bytes of a frame that are captured."""
     magic = 0xA1B23C4D if nanoseconds else 0xA1B2C3D4
     out = [struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, LINKS.get(shape, 1))]
     rows = [(entry, 200) for entry in entries]
@@ -73,14 +74,15 @@ def pcap(
     for number, (entry, host) in enumerate(rows):
         for frame in packets(entry, shape, number, host):
             seconds, rest = divmod(entry[0], 10**9)
-            out.append(
-                struct.pack(order + "4I", seconds, rest if nanoseconds else rest // 1000, len(frame), len(frame))
-            )
-            out.append(frame)
+            fraction, size = rest if nanoseconds else rest // 1000, min(len(frame), most)
+            out.append(struct.pack(order + "4I", seconds, fraction, size, len(frame)))
+            out.append(frame[:size])
     return b"".join(out)
 
 
-def pcapng(entries: Iterable[Entry], shape: str = "plain", *, order: str = "<", exponent: int = 9) -> bytes:
+def pcapng(
+    entries: Iterable[Entry], shape: str = "plain", *, order: str = "<", exponent: int = 9, most: int = 65535
+) -> bytes:
     def block(kind: int, body: bytes) -> bytes:
         body += bytes(-len(body) % 4)
         length = struct.pack(order + "I", 12 + len(body))
@@ -98,6 +100,7 @@ def pcapng(entries: Iterable[Entry], shape: str = "plain", *, order: str = "<", 
     for number, entry in enumerate(entries):
         for frame in packets(entry, shape, number):
             units = entry[0] // 10 ** (9 - exponent)
-            body = struct.pack(order + "5I", 1, units >> 32, units & 0xFFFFFFFF, len(frame), len(frame)) + frame
+            size = min(len(frame), most)
+            body = struct.pack(order + "5I", 1, units >> 32, units & 0xFFFFFFFF, size, len(frame)) + frame[:size]
             out.append(block(6, body))
     return b"".join(out)

@@ -282,6 +282,16 @@ def test_a_file_cut_off_is_used_up_to_there(tmp_path: Path) -> None:
     assert any("cut off" in finding.text for finding in findings)
 
 
+@pytest.mark.parametrize("kind", ["pcap", "pcapng"])
+@pytest.mark.parametrize("most", [96, 200])
+def test_packets_that_are_not_captured_whole_are_named(tmp_path: Path, kind: str, most: int) -> None:
+    """200 bytes hold the IMU's."""
+    path = tmp_path / f"walk.{kind}"
+    path.write_bytes((captures.pcap if kind == "pcap" else captures.pcapng)(walk(), most=most))
+    with pytest.raises(HemislamError, match="only the begin of each packet; capture them whole"):
+        open_recording(path, Params())
+
+
 def test_other_files_are_refused_with_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "x.pcap"
     for content, words in (
