@@ -7,7 +7,7 @@ import numpy as np
 
 from app.georeference import crs
 from app.georeference.align import Alignment
-from app.georeference.fixes import Fixes
+from app.georeference.fixes import Fixes, require_degrees
 from app.georeference.ground import Ground
 from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.tables import NamedColumns, table_of
@@ -52,8 +52,6 @@ def align_with_points(
     if len(count) < 3:
         raise HemislamError(_left_open(count))
     there, at = np.array([places[one] for one in names]), np.array([picked[one] for one in names])
-    if not np.isfinite(there).all():
-        raise HemislamError(f"A control point of {control.source} lacks a coordinate; fill it in or remove it.")
     if lost := next((one for one, place in zip(names, at, strict=True) if not np.isfinite(place).all()), None):
         raise HemislamError(f"Control point {lost} was picked at no place of the map; pick it again.")
     _refuse_line(at[used], count)
@@ -91,28 +89,33 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
     """The grid and (3,) easting, northing, height of each control point by name.
 
     Raises:
-        HemislamError: it lacks columns, a name or the grid, or names a point twice.
+        HemislamError: it lacks the grid, or as `sound_places`.
     """
-    columns, names = _coordinates(table), _names(table)
+    columns, numbers = sound_places(table)
     if columns == _EASTINGS:
         if not grid:
             raise HemislamError(f"{table.source} holds eastings and northings; say of which grid: EPSG:CODE.")
         crs.projected(grid)
-        numbers = table.numbers(*columns)
     else:
-        degrees = table.numbers(*columns)
-        every = Fixes.of(np.arange(len(degrees)), degrees).sound(table.source)  # rows stand for times
-        ground = Ground.of(every, grid)
-        grid = ground.centre.crs
-        numbers = np.full(degrees.shape, np.nan)
-        numbers[every.stamps_ns] = ground.grid
-    return grid, dict(zip(names, numbers, strict=True))
+        latitude, longitude, height = numbers.T
+        turned = np.column_stack([latitude, np.unwrap(longitude, period=360.0), height])
+        ground = Ground.of(Fixes.of(np.zeros(len(turned)), turned), grid)
+        grid, numbers = ground.centre.crs, ground.grid
+    return grid, dict(zip(table.columns["name"], numbers, strict=True))
 
 
-def require_sound(table: NamedColumns) -> None:
-    """Raises HemislamError unless every row is a control point with a name of its own and all coordinates."""
+def sound_places(table: NamedColumns) -> tuple[tuple[str, str, str], F64]:
+    """The columns of the places, and (n, 3) their numbers.
+
+    Raises:
+        HemislamError: a row is not a control point on Earth with a name of its own and all coordinates.
+    """
     columns, _ = _coordinates(table), _names(table)
     _refuse_gaps(table, *columns)
+    numbers = table.numbers(*columns)
+    if columns == _DEGREES:
+        require_degrees(numbers, table.source, "row")
+    return columns, numbers
 
 
 def _refuse_gaps(table: NamedColumns, *columns: str) -> None:

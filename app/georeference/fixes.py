@@ -40,15 +40,25 @@ class Fixes(Samples):
         order = np.flatnonzero(there)[np.argsort(self.stamps_ns[there], kind="stable")]
         if len(order) < 3:
             raise HemislamError(f"{source} holds {len(order)} fixes with a position; at least 3 are needed.")
+        require_degrees(self.places, source, "fix")
         latitude, longitude, height = self.places[order].T
-        if (np.abs(latitude) > 90).any():
-            advice = "exchange them" if (np.abs(longitude) <= 90).all() else "both must be in degrees"
-            raise HemislamError(
-                f"{source} has a latitude of {latitude[np.argmax(np.abs(latitude))]:.4f}°, beyond 90°;"
-                f" latitude and longitude seem to be swapped: {advice}."
-            )
-        if (np.abs(longitude) > 360).any():
-            raise HemislamError(f"{source} has a longitude beyond 360°; it must be in degrees.")
         places = np.column_stack([latitude, np.unwrap(longitude, period=360.0), height])
         sigmas = np.where(np.isfinite(self.sigmas) & (self.sigmas > 0), self.sigmas, np.nan)
         return Fixes(self.stamps_ns[order], places, sigmas[order])
+
+
+def require_degrees(places: F64, source: str, kind: str) -> None:
+    """Raises HemislamError: a latitude or longitude, degrees, is beyond its range. kind: what a row is called."""
+    latitude, longitude = np.abs(places[:, :2]).T
+    if not (latitude <= 90).any() and (latitude > 90).any() and not (longitude > 90).any():
+        raise HemislamError(
+            f"{source} has latitudes beyond 90° only; latitude and longitude seem to be swapped: exchange them."
+        )
+    for column, name, most in ((0, "latitude", 90), (1, "longitude", 360)):
+        beyond = np.abs(places[:, column]) > most
+        if beyond.any():
+            row = int(np.argmax(beyond))
+            raise HemislamError(
+                f"{source}, {kind} {row + 1}: the {name} {places[row, column]:.4f}° is beyond {most}°;"
+                " give it in degrees, or remove it."
+            )

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from app.georeference.align import Alignment
-from app.georeference.control import control_table, require_sound
+from app.georeference.control import control_table, sound_places
 from app.georeference.ledger import in_rows
 from app.georeference.survey import Pick, Survey
 from app.mapping.kept import Spot
@@ -127,7 +127,7 @@ class GeoreferencePanel:
         if len(content) > _MOST_BYTES:
             raise HemislamError(f"A table of control points may have at most {_MOST_BYTES >> 10} kB.")
         text = content.decode("utf-8-sig", errors="replace")
-        require_sound(control_table(text))
+        sound_places(control_table(text))
         self._control = text
         self._show_widgets()
 

@@ -70,7 +70,7 @@ def test_a_point_without_its_easting_is_reported_as_such(tmp_path: Path) -> None
     head, first, *others = control.read_text().splitlines()
     name, _, north, height = first.split(",")
     control.write_text("\n".join([head, f"{name},,{north},{height}", *others]))
-    with pytest.raises(HemislamError, match="lacks a coordinate"):
+    with pytest.raises(HemislamError, match="row 1: the east is missing"):
         laid(control, picks, grid="EPSG:32632")
 
 
@@ -90,6 +90,24 @@ def test_swapped_columns_or_names_are_told_by_the_map_that_they_turn_over(tmp_pa
     picks.write_text(picks.read_text().replace("A,", "a,").replace("B,", "A,").replace("a,", "B,"))
     with pytest.raises(HemislamError, match="names exchanged"):
         laid(control, picks, grid="EPSG:32632")
+
+
+@pytest.mark.parametrize(
+    ("first", "words"),
+    [
+        ("95,11.5", "row 1: the latitude 95.0000° is beyond 90°; give it in degrees"),
+        ("48,4300", "row 1: the longitude 4300.0000° is beyond 360°"),
+        ("48,11.5", "only A and B are"),
+    ],
+)
+def test_a_place_beyond_the_earth_is_refused_by_its_row_and_few_places_are_not_called_fixes(
+    tmp_path: Path, first: str, words: str
+) -> None:
+    control, picks = tmp_path / "degrees.csv", tmp_path / "picks.csv"
+    control.write_text(f"name,lat,lon,height\nA,{first},5\nB,48.1,11.5,5\n")
+    picks.write_text("name,x,y,z\nA,0,0,0\nB,9,0,0\n")
+    with pytest.raises(HemislamError, match=words):
+        laid(control, picks)
 
 
 def test_a_point_that_is_given_twice_is_named(tmp_path: Path) -> None:

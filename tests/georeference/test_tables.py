@@ -86,6 +86,8 @@ def checksum(sentence: str) -> str:
     [
         ("time,lat,lon,height\n1,48,11,5\n", "holds 1 fixes"),
         ("time,lat,lon,height\n" + "1,148,11,5\n" * 3, "swapped: exchange them"),
+        ("time,lat,lon,height\n1,48,11,5\n2,95,11,5\n3,48,11,5\n", r"fix 2: the latitude 95.0000° is beyond 90°"),
+        ("time,lat,lon,height\n" + "1,4812.5,1134.2,5\n" * 3, r"fix 1: the latitude 4812.5000° .* in degrees"),
         ("time,lat,lon,height\n" + "1,48,11\n" * 3, "row 1 has 3 columns"),
         ("time,lat,lon,height\n" + "1,x,11,5\n" * 3, "`x` is not a number"),
         ("time,lat,lon,height\n" + "noon,48,11,5\n" * 3, "neither Unix seconds nor a date"),

@@ -267,6 +267,22 @@ def test_a_row_that_is_no_control_point_is_named_when_the_table_is_loaded(paging
     assert paging.panel._control == ""
 
 
+@pytest.mark.parametrize(
+    ("places", "why"),
+    [
+        (("48.1,11.5", "95,11.5", "48.1,11.6"), "row 2: the latitude 95.0000° is beyond 90°"),
+        (("121.1,31.5", "121.2,31.5", "121.1,31.6"), "seem to be swapped: exchange them"),
+    ],
+)
+def test_a_latitude_beyond_the_pole_is_refused_when_the_table_is_loaded(
+    paging: Paging, places: tuple[str, ...], why: str
+) -> None:
+    rows = "".join(f"P{number},{place},520\n" for number, place in enumerate(places))
+    with pytest.raises(HemislamError, match=why):
+        paging.panel._uploaded(f"name,lat,lon,height\n{rows}".encode())
+    assert paging.panel._control == ""
+
+
 def test_a_session_that_names_a_point_twice_does_not_offer_it_twice(paging: Paging) -> None:
     paging.show(Snapshot(earth=Earth(Survey(control=f"{TABLE}P1,691520,5334700,520\n"))))
     assert paging.panel._name.options == ("P1", "P2", "P3")
