@@ -40,6 +40,10 @@ _NAMES = {
     "z": ("z", "z_m"),
 }
 """The kinds of columns, with their headings in small letters without units in brackets."""
+_IN = {"time": "seconds", "week_s": "seconds", "latitude": "degrees", "longitude": "degrees"}
+"""What the numbers of a kind are in; others are in metres."""
+_OTHER_UNITS = re.compile(r"[\(\[]\s*(mm|cm|km|(us[ -]?)?(ft|feet)(us)?|rad|radians|gon|ms|us|µs|ns)\s*[\)\]]")
+"""A unit in brackets, in small letters, that is none of these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +75,7 @@ class NamedColumns:
 
 def read_table(path: Path, *wanted: str) -> NamedColumns:
     """As `table_of`, from a file. Raises HemislamError also if the file cannot be read."""
-    return table_of(read_text(path, "save it as CSV").splitlines(), str(path), *wanted)
+    return table_of(read_text(path, "save it as CSV in UTF-8").splitlines(), str(path), *wanted)
 
 
 def table_of(lines: Sequence[str], source: str, *wanted: str) -> NamedColumns:
@@ -81,7 +85,8 @@ def table_of(lines: Sequence[str], source: str, *wanted: str) -> NamedColumns:
         source: name in error messages. wanted: the columns needed, in case a heading may mean several things.
 
     Raises:
-        HemislamError: the table has no heading, a quotation mark is not closed, or a row is incomplete.
+        HemislamError: the table has no heading, a quotation mark is not closed, a column is in another unit than it
+            must be, or a row is incomplete.
     """
     rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
@@ -102,6 +107,9 @@ def table_of(lines: Sequence[str], source: str, *wanted: str) -> NamedColumns:
         found = [at for at, title in enumerate(titles) if title in _NAMES[what] and at not in known.values()]
         if found:
             known[what] = found[0]
+        if found and _OTHER_UNITS.search(cells[0][found[0]].lower()):
+            unit = _IN.get(what, "metres")
+            raise HemislamError(f"{source} has the column `{cells[0][found[0]][:40]}`; convert it to {unit}.")
     body = cells[1:]
     if cut := next((row for row, one in enumerate(body, 1) if len(one) < len(titles)), 0):
         raise HemislamError(f"{source}, row {cut} has {len(body[cut - 1])} columns, but its heading {len(titles)}.")

@@ -34,6 +34,12 @@ def test_a_table_with_sigmas_is_read_to_the_last_digit_of_its_times(tmp_path: Pa
     assert height == "ellipsoidal"
 
 
+@pytest.mark.parametrize("unit", ["m", "metres", "ellipsoidal", "WGS84", "EPSG:25832", "inside"])
+def test_brackets_behind_a_heading_are_no_part_of_it(tmp_path: Path, unit: str) -> None:
+    text = f"Time [s];Latitude (°);Longitude [deg];Height ({unit})\n" + "1;48;11;5\n" * 3
+    assert read_fixes(written(tmp_path, text), NEAR_NS)[0].places.tolist() == [[48.0, 11.0, 5.0]] * 3
+
+
 def test_dates_are_read_and_rows_are_brought_in_order_of_time(tmp_path: Path) -> None:
     text = "Time;Latitude [deg];Longitude [deg];Altitude (m)\n" + "".join(
         f"2023-11-14T22:13:2{k}Z;48.1;11.{k};520\n" for k in (2, 0, 1)
@@ -100,6 +106,9 @@ def checksum(sentence: str) -> str:
         ('time,lat,"lon,height\n' + "1,48,11,5\n" * 20_000, "a quotation mark without its pair"),
         ("time,lat,lon,height\n" + ",48,11,5\n" * 3, "the time `` is neither Unix seconds nor a date"),
         ("tow,lat,lon,height\n", "holds 0 fixes"),
+        ("time,lat,lon,Altitude (ft)\n" + "1,48,11,1700\n" * 3, r"the column `Altitude \(ft\)`; convert it to metres"),
+        ("time,lat [rad],lon [rad],height\n" + "1,0.8,0.2,5\n" * 3, "convert it to degrees"),
+        ("Time (ms),lat,lon,height\n" + "1,48,11,5\n" * 3, "convert it to seconds"),
         ("tow,lat,lon,height\n1,48,11,5\n,48,11,5\n", "row 2: the time `` is not in GPS seconds"),
         ("tow,lat,lon,height\n" + "1700000000000,48,11,5\n" * 3, "is not in GPS seconds"),
         ("1,2,3,4\n" * 3, "its first line must name the columns"),
