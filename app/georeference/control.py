@@ -82,7 +82,7 @@ def _left_open(names: list[str]) -> str:
     """What fewer than three points leave open, in a sentence."""
     found = f"only {' and '.join(names)} {'is' if len(names) == 1 else 'are'}" if names else "none is"
     rest = ("the map's place", "the map's rotation", "the map's rotation about the line through both")
-    return f"At least 3 control points must be picked in the map, but {found}: {rest[len(names)]} is undetermined."
+    return f"At least 3 control points must be picked and accepted, but {found}: {rest[len(names)]} is undetermined."
 
 
 def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64]]:

@@ -164,6 +164,11 @@ def test_a_point_that_the_user_leaves_out_pulls_nothing_and_still_shows_how_far_
     assert np.linalg.norm(found.residuals[3]) == pytest.approx(1.0, abs=1e-3)
 
 
+def test_points_that_are_rejected_are_not_said_to_be_unpicked(tmp_path: Path) -> None:
+    with pytest.raises(HemislamError, match="must be picked and accepted, but only C and D are"):
+        laid(*written(tmp_path, CORNERS), grid="EPSG:32632", overridden={"A": False, "B": False})
+
+
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_pick_that_is_no_place_is_refused_by_its_name(number: float, tmp_path: Path) -> None:
     """A session file may hold any number."""
