@@ -127,9 +127,11 @@ def uncalibrated(recording: Path) -> Path | None:
 
 def calibrated_beside(recording: Path) -> str:
     """A sentence that names the calibration in use beside a recording; "" if there is none."""
-    path = sidecar(recording)
-    ours = _first_line(path).startswith(CALIBRATED)
-    return f"Using the calibration beside the recording: {path}; delete it to undo this." if ours else ""
+    path, first = sidecar(recording), _first_line(sidecar(recording))
+    if not first.startswith(CALIBRATED):
+        return ""
+    undo = f"rename {path.name}.old to {path.name}" if first.startswith(MERGED) else "delete it"
+    return f"Using the calibration beside the recording: {path}; {undo} to undo this."
 
 
 def _first_line(path: Path) -> str:

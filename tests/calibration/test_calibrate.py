@@ -107,7 +107,7 @@ def test_what_was_found_is_kept_beside_the_recording_and_undone_by_deleting_it(t
     params = resolve_params(recording, "mid360", None, [])
     assert np.allclose(params.sensor.rotation, [70.0, -50.0, 104.0], atol=1e-2)
     assert params.recording.imu_time_offset == pytest.approx(0.02)
-    assert str(path) in calibrated_beside(recording)
+    assert f"{path}; delete it to undo" in calibrated_beside(recording)
     write_beside(recording, known(recording).found())  # its own file may be replaced
     path.unlink()
     assert calibrated_beside(recording) == ""
@@ -127,6 +127,7 @@ def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path)
     assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
     assert params.sensor.translation[0] == pytest.approx(-0.011)
     assert (tmp_path / "walk.params.yaml.old").read_text() == mine
+    assert "; rename walk.params.yaml.old to walk.params.yaml to undo" in calibrated_beside(recording)
     other = known(recording)
     again = replace(other, moved=replace(other.moved, p_imu_lidar=MID360 + 0.02))
     write_beside(recording, again.found())  # unasked
@@ -134,6 +135,7 @@ def test_a_file_that_a_person_wrote_is_never_overwritten_unasked(tmp_path: Path)
     assert (params.sensor.max_range, params.filter.max_points) == (40, 700)
     assert params.sensor.translation[0] == pytest.approx(0.009)
     assert (tmp_path / "walk.params.yaml.old").read_text() == mine
+    assert "; rename walk.params.yaml.old to walk.params.yaml to undo" in calibrated_beside(recording)
 
 
 def test_an_earlier_calibration_does_not_count_as_given(tmp_path: Path) -> None:
