@@ -38,8 +38,8 @@ class MapComparePanel:
         gui = page.gui
         self._page, self._folders, self._results, self._colour_by = page, folders, results, colour_by
         self._session, self._before = -1, LOOK  # the colour mode that distances replaced
-        self._chunks: tuple[Chunk, ...] = ()  # chunks that were compared last
-        self._name = ""
+        self._asked: tuple[tuple[Chunk, ...], str] = (), ""  # chunks and other map of the comparison that was begun
+        self._chunks, self._name = tuple[Chunk, ...](), ""  # of the comparison that is shown
         self._comparison: Comparison | None = None
         self._distance: MapNumbers | None = None
         self._density = Density(page.now)
@@ -122,7 +122,7 @@ class MapComparePanel:
         wanted = MapsToCompare(
             scans, other, by_truth, where, self._fit.value and not by_truth, float(self._reach.value)
         )
-        self._chunks, self._name = current.chunks, "the truth" if by_truth else other.name
+        self._asked = current.chunks, "the truth" if by_truth else other.name
         self._work.begin(find, wanted)
 
     def _receive(self) -> None:
@@ -130,7 +130,7 @@ class MapComparePanel:
             match message:
                 case Comparison():
                     self.close()
-                    self._comparison = message
+                    self._comparison, (self._chunks, self._name) = message, self._asked
                     self._distance = MapNumbers.split(self._chunks, message.distance, _limits(message))
                     self._colour_by(DISTANCE)
                 case sentence:

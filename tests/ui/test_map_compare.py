@@ -118,6 +118,18 @@ def test_a_map_that_has_changed_since_is_said_to_be_old(comparing: Comparing) ->
     assert "changed since" in comparing.panel._found.content
 
 
+def test_a_comparison_that_fails_leaves_name_and_age_of_the_one_shown(comparing: Comparing) -> None:
+    user_clicks(comparing.panel._truth)
+    comparing.draw(FOUND)
+    comparing.now = replace(NOW, chunks=(*CHUNKS, chunk_of(2, 5)), keyframe_poses=np.tile(np.eye(4), (3, 1, 1)))
+    comparing.draw()
+    comparing.panel._begin(Path("broken.ply"))
+    comparing.draw("broken.ply cannot be read.")
+    comparing.draw()
+    html = comparing.panel._found.content
+    assert "the truth" in html and "changed since" in html and "broken.ply" not in html
+
+
 def test_another_session_has_no_comparison_and_the_colours_from_before(comparing: Comparing) -> None:
     comparing.panel.seen(NOW, View(colour_by=HEIGHT))
     user_clicks(comparing.panel._truth)
