@@ -12,7 +12,7 @@ from app.evaluation.cloud_distance import REACH_M, Comparison
 from app.evaluation.map_comparison import KeyframePoints, MapsToCompare, find, sentences
 from app.export.read_points import CLOUDS
 from app.server.folders import Folders
-from app.server.protocol import Chunk, Snapshot
+from app.server.protocol import Snapshot
 from app.ui.background import Background
 from app.ui.colours import DENSITY, DISTANCE, LOOK, MODES, TABLES, Limits, value_colours
 from app.ui.files import FileList
@@ -24,7 +24,7 @@ _BINS: Final = 41
 _LEAST_M: Final = 0.005
 """The colours cover at least this distance on either side."""
 _WHAT: Final = "How far each point of the map lies in front of the surface of another map, or behind it."
-_OLD: Final = "The map has changed since; points without a distance are grey. Compare again."
+_OLD: Final = "The map has changed since: distances are from before, and new points are grey. Compare again."
 
 
 class MapComparePanel:
@@ -38,8 +38,8 @@ class MapComparePanel:
         gui = page.gui
         self._page, self._folders, self._results, self._colour_by = page, folders, results, colour_by
         self._session, self._before = -1, LOOK  # the colour mode that distances replaced
-        self._asked: tuple[tuple[Chunk, ...], str] = (), ""  # chunks and other map of the comparison that was begun
-        self._chunks, self._name = tuple[Chunk, ...](), ""  # of the comparison that is shown
+        self._asked = Snapshot(), ""  # map and name of the other map in the comparison that was begun
+        self._compared, self._name = self._asked  # in the comparison that is shown
         self._comparison: Comparison | None = None
         self._distance: MapNumbers | None = None
         self._density = Density(page.now)
@@ -82,7 +82,9 @@ class MapComparePanel:
         running, recording = self._work.running, current.recording
         self._choose.disabled = self._truth.disabled = running or not current.chunks
         self._truth.visible = recording is not None and recording.truth is not None
-        old = self._distance is not None and current.chunks is not self._chunks
+        then = self._compared
+        moved = current.chunks is not then.chunks or current.keyframe_poses is not then.keyframe_poses
+        old = self._distance is not None and moved
         if self._changes(self._comparison, old):
             found = self._comparison
             self._found.content = summary(found, self._name, [_OLD] if old else []) if found is not None else ""
@@ -122,7 +124,7 @@ class MapComparePanel:
         wanted = MapsToCompare(
             scans, other, by_truth, where, self._fit.value and not by_truth, float(self._reach.value)
         )
-        self._asked = current.chunks, "the truth" if by_truth else other.name
+        self._asked = current, "the truth" if by_truth else other.name
         self._work.begin(find, wanted)
 
     def _receive(self) -> None:
@@ -130,8 +132,8 @@ class MapComparePanel:
             match message:
                 case Comparison():
                     self.close()
-                    self._comparison, (self._chunks, self._name) = message, self._asked
-                    self._distance = MapNumbers.split(self._chunks, message.distance, _limits(message))
+                    self._comparison, (self._compared, self._name) = message, self._asked
+                    self._distance = MapNumbers.split(self._compared.chunks, message.distance, _limits(message))
                     self._colour_by(DISTANCE)
                 case sentence:
                     self.close()

@@ -118,6 +118,14 @@ def test_a_map_that_has_changed_since_is_said_to_be_old(comparing: Comparing) ->
     assert "changed since" in comparing.panel._found.content
 
 
+def test_a_map_that_an_edit_of_a_loop_has_moved_since_is_said_to_be_old(comparing: Comparing) -> None:
+    user_clicks(comparing.panel._truth)
+    comparing.draw(FOUND)
+    comparing.now = replace(NOW, keyframe_poses=NOW.keyframe_poses + 0.1)
+    comparing.draw()
+    assert "changed since" in comparing.panel._found.content
+
+
 def test_a_comparison_that_fails_leaves_name_and_age_of_the_one_shown(comparing: Comparing) -> None:
     user_clicks(comparing.panel._truth)
     comparing.draw(FOUND)
