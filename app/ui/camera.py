@@ -23,8 +23,8 @@ _LEFT_OUT: Final = 0.1
 _LEAST_M: Final = 4.0
 _SOME: Final = 20_000
 """Points of the map that a view is fitted to."""
-_BAR_PX: Final = 80
-"""Height of the strip at the scene's lower edge that the transport covers, until the page reports it."""
+_BAR: Final = 8
+"""Percent of the scene's height, at its lower edge, that the transport covers until the page reports it."""
 _FAR: Final = 10.0
 """The far clipping plane, as a multiple of the distance to the middle of the map."""
 FIT, OBLIQUE, PLAN, TOP, FRONT, SIDE = "fit", "3D", "plan", "top", "front", "side"
@@ -123,7 +123,7 @@ class Framing:
         self._fitted: dict[tuple[object, ...], Stand] = {}
         self._stands: dict[int, Stand] = {}  # of each browser, as last shown
         self._left: set[int] = set()  # browsers whose cameras were sent elsewhere
-        self._covered: dict[int, int] = {}  # pixels hidden in each browser's scene
+        self._covered: dict[int, int] = {}  # percent hidden of the height of each browser's scene
         server.initial_camera.fov = FOV
         self._begin(np.zeros(3))
 
@@ -164,16 +164,16 @@ class Framing:
         """Leave a browser's camera alone, since it is sent elsewhere; a slow browser may still report its old place."""
         self._left.add(client.client_id)
 
-    def cover(self, client: viser.ClientHandle, pixels: int) -> None:
+    def cover(self, client: viser.ClientHandle, percent: int) -> None:
         """Keep the map above the transport and the diagnostics, which hide the lower edge of a browser's scene."""
-        self._covered[client.client_id] = pixels
+        self._covered[client.client_id] = percent
 
     def picture(self, client: viser.ClientHandle) -> Picture:
         """The picture in which a browser shows the scene."""
         camera = client.camera
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
         shape = round(width / height, 2) or 0.01
-        covered = round(self._covered.get(client.client_id, _BAR_PX) / height, 2)
+        covered = self._covered.get(client.client_id, _BAR) / 100
         return Picture(camera.fov, shape, min(covered, 0.4))
 
     def follow(self) -> None:

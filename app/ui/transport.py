@@ -41,14 +41,14 @@ class TransportPanel:
     The strips of `app.ui.timeline` unfold above it.
 
     choose_ends: called with the ends of the colour bar chosen by the user, in percent of all values.
-    cover: called with a browser and the number of pixels of its scene that the bar and the strips hide.
+    cover: called with a browser and the percentage of its scene's height that the bar and the strips hide.
     """
 
     def __init__(
         self,
         page: Page,
         choose_ends: Callable[[int, int], None] = lambda low, high: None,
-        cover: Callable[[viser.ClientHandle, int], None] = lambda client, pixels: None,
+        cover: Callable[[viser.ClientHandle, int], None] = lambda client, percent: None,
     ) -> None:
         gui, send = page.gui, page.send
         self._send, self._snapshot, self._choose_ends = page.send, page.snapshot, choose_ends
@@ -76,7 +76,7 @@ class TransportPanel:
             self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
     def _asked(self, word: str, client: viser.ClientHandle) -> None:
-        """Handle what the script sends: "play", "pause", "step -1", "seek 812", "speed 2×", "ends 0 80", "cover 66"."""
+        """Handle what the script sends: "play", "pause", "step -1", "seek 812", "speed 2×", "ends 0 80", "cover 12"."""
         match word.split(" ", 1):
             case ["play"]:
                 self.toggle()
@@ -90,8 +90,8 @@ class TransportPanel:
                 self._send(Seek(int(frame)))
             case ["speed", name] if name in SPEEDS:
                 self._send(SetSpeed(SPEEDS[name]))
-            case ["cover", pixels] if pixels.isdecimal():
-                self._cover(client, int(pixels))
+            case ["cover", percent] if percent.isdecimal():
+                self._cover(client, int(percent))
             case ["ends", shares]:
                 low, _, high = shares.partition(" ")
                 if low.isdecimal() and high.isdecimal() and int(low) < int(high) <= 100:

@@ -212,7 +212,7 @@ const settle = () => {
     const style = document.documentElement.style;
     const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
     put('--hs-beside', innerWidth - box.right); put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
-    const hidden = Math.max(0, Math.round(box.bottom + 8 - dock.getBoundingClientRect().top));
+    const above = box.bottom + 8 - dock.getBoundingClientRect().top, hidden = Math.round(100 * Math.max(0, above / box.height) || 0);
     if (hidden !== covered) { covered = hidden; tell('cover ' + hidden); }
   }
   setTimeout(settle, 300);
