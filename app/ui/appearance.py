@@ -1,5 +1,6 @@
 """The controls for the look of the scene, and the legend that explains its colours."""
 
+from dataclasses import replace
 from typing import Final
 
 import viser
@@ -44,6 +45,7 @@ class AppearancePanel:
         self._looks = looks
         self._legend = legend
         self._limits: Limits | None = None  # ends of all values
+        self._lines: list[tuple[Rgb, str]] = []  # colours and names of what is drawn beside the points
         self._ends: dict[str, Limits] = {}  # by colour mode, as the user chose them
         self._colour_by = gui.add_dropdown(
             "colour by", COLOUR_BY, initial_value=default.colour_by, hint="Meaning of the colours. C: next mode."
@@ -95,8 +97,9 @@ class AppearancePanel:
 
     @property
     def key(self) -> Key:
-        """What the colours mean at present."""
-        return key(self._colour_by.value, self._limits, self._ends.get(self._colour_by.value))
+        """What the colours mean at present, those of lines included."""
+        points = key(self._colour_by.value, self._limits, self._ends.get(self._colour_by.value))
+        return replace(points, names=(*points.names, *self._lines))
 
     def colour_by(self, mode: str) -> None:
         """Choose a colour mode, and let the colours span all its values again."""
@@ -125,7 +128,7 @@ class AppearancePanel:
 
         lines: colours and names of what else is drawn. While neither map nor scan is, their colours need no key.
         """
-        self._limits = limits
+        self._limits, self._lines = limits, lines
         by = LABEL if view.tuning else view.colour_by
         colours = legend(by, limits, view.ends) if view.map or view.scan else ""
         self._legend.content = panel("legend", colours, lines, view.grid)

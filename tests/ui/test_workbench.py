@@ -55,6 +55,16 @@ def test_frames_are_sent_at_the_rate_that_eyes_follow(page: Page, wire: Wire) ->
     assert 10 <= len(scans) <= 16
 
 
+def test_a_picture_names_the_same_lines_as_the_page(page: Page) -> None:
+    page.engine.send(StepFrame(3))
+    page.draw(1.0)
+    appearance = page.workbench._appearance
+    assert "path" in appearance._legend.content and "path" in [name for _, name in appearance.key.names]
+    appearance._layers["path"].value = False
+    page.draw(1.0)
+    assert "path" not in [name for _, name in appearance.key.names]
+
+
 def test_a_ground_slider_dims_the_map_until_something_else_is_done_and_another_does_not(
     page: Page, server: viser.ViserServer
 ) -> None:
