@@ -29,7 +29,7 @@ def refusal(error: OSError) -> str:
 
 @contextmanager
 def writing_to(path: Path | None) -> Iterator[None]:
-    """Name the file, or the folder of temporary files if None, in errors of writing, where the system names none."""
+    """Name the file or folder, or the folder of temporary files if None, in errors of writing that name none."""
     try:
         yield
     except OSError as error:

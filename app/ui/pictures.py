@@ -13,7 +13,7 @@ import numpy as np
 import viser
 
 from app.server.protocol import Snapshot
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, writing_to
 from app.slam.types import U8
 from app.ui.colours import Key
 from app.ui.files import result_folder_name, size_text
@@ -142,7 +142,7 @@ class PicturesPanel:
         """Write the pictures one after another. If stopped, leave no file."""
         part, (key, light), session = file.with_suffix(".part"), self._key(), self._page.snapshot().session
         try:
-            with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as pictures:
+            with writing_to(file.parent), zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as pictures:
                 for number, station in enumerate(stations, 1):
                     here = replace(station, position=station.position + self._page.offset())
                     rendered = self._rendered(client, here)
@@ -154,9 +154,6 @@ class PicturesPanel:
                     self._share = number / len(stations)
             part.replace(file)
             self._saved = file
-        except OSError as error:
-            error.filename = error.filename or str(file.parent)  # a full disk names no file
-            raise
         finally:
             part.unlink(missing_ok=True)
 
