@@ -4,11 +4,11 @@ Tests app/ui/appearance.py, in both themes.
 """
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from app.server.chunks import MOST_SHOWN
 from app.server.protocol import StepFrame
-from tests.browser.conftest import Bench
+from tests.browser.conftest import ALPHA, SLIDERS, Bench, new_page
 
 TABS = ("Parameters", "Readouts", "Loops", "Study", "A/B", "Auto-tune", "View", "Recording", "Help")
 
@@ -147,3 +147,26 @@ def test_a_frame_draws_each_keyframe_once_and_no_more_points_than_the_page_holds
     assert drawn.points <= most["points"] <= drawn.points + len(result.cloud) + 10
     assert keyframes <= most["calls"] <= keyframes + 60, "the rest: scan, path, wedge, plane, grid, labels"
     assert keyframes <= MOST_SHOWN
+
+
+def test_a_tooltip_in_a_narrow_window_stands_above_the_sheet(bench: Bench, chromium: Browser) -> None:
+    page = new_page(chromium, 560, 800)
+    page.goto(bench.url)
+    tab, tip = page.get_by_role("tab", name="Parameters").first, page.locator(".mantine-Tooltip-tooltip")
+    sheet = page.locator("[style*='max-height: 60%']").element_handle()
+
+    def stands_above() -> bool:
+        page.locator(SLIDERS).nth(ALPHA).hover()
+        expect(tip).to_be_visible()
+        bottom, top = "(tip) => tip.getBoundingClientRect().bottom", "(sheet) => sheet.getBoundingClientRect().top"
+        return float(tip.evaluate(bottom)) < sheet.evaluate(top) < before
+
+    before = 800.0
+    tab.click()
+    bench.eventually(stands_above)
+    before = sheet.evaluate("(sheet) => sheet.getBoundingClientRect().top")
+    page.get_by_role("button", name="Diagnostics").click()
+    bench.eventually(stands_above)
+    page.get_by_role("button", name="Diagnostics").click()
+    expect(tip).to_have_count(0)
+    page.close()

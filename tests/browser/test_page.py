@@ -352,29 +352,6 @@ def test_on_a_phone_the_scene_has_most_of_the_page_until_a_tab_is_tapped(bench: 
     page.close()
 
 
-def test_a_tooltip_in_a_narrow_window_stands_above_the_sheet(bench: Bench, chromium: Browser) -> None:
-    page = new_page(chromium, 560, 800)
-    page.goto(bench.url)
-    tab, tip = page.get_by_role("tab", name="Parameters").first, page.locator(".mantine-Tooltip-tooltip")
-    sheet = page.locator("[style*='max-height: 60%']").element_handle()
-
-    def stands_above() -> bool:
-        page.locator(SLIDERS).nth(ALPHA).hover()
-        expect(tip).to_be_visible()
-        bottom, top = "(tip) => tip.getBoundingClientRect().bottom", "(sheet) => sheet.getBoundingClientRect().top"
-        return float(tip.evaluate(bottom)) < sheet.evaluate(top) < before
-
-    before = 800.0
-    tab.click()
-    bench.eventually(stands_above)
-    before = sheet.evaluate("(sheet) => sheet.getBoundingClientRect().top")
-    page.get_by_role("button", name="Diagnostics").click()
-    bench.eventually(stands_above)
-    page.get_by_role("button", name="Diagnostics").click()
-    expect(tip).to_have_count(0)
-    page.close()
-
-
 def test_a_side_of_the_clip_box_is_pulled_by_its_handle(bench: Bench) -> None:
     for _ in range(3):
         bench.engine.send(StepFrame())
