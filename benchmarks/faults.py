@@ -29,27 +29,28 @@ PACKET_NS = 1_000_000
 
 @dataclass
 class Moment:
-    """One measurement on its way to the engine. A fault changes it; without a scan, its samples wait for the next one.
+    """One measurement on its way to the engine. A fault changes it.
 
     Attributes:
         index: of the scan. since_s: time since the first scan.
+        lost: whether the scan does not arrive; its samples then wait for the next one.
     """
 
-    scan: Scan | None
+    scan: Scan
     imu: ImuSamples
     index: int
     since_s: float
     rng: np.random.Generator
+    lost: bool = False
 
-    def ranges(self, changed: F64) -> None:
+    def change_ranges(self, changed: F64) -> None:
         """Replace the ranges of points; nan leaves a range as it is. changed: (n,) m."""
-        assert self.scan is not None
         points = self.scan.points.astype(np.float64)
         measured = np.linalg.norm(points, axis=1)
         factor = np.where(np.isnan(changed), 1.0, changed / measured)
         self.scan = replace(self.scan, points=(points * factor[:, None]).astype(np.float32))
 
-    def add(self, gyro: F64, accel: F64 | None = None) -> None:
+    def add_errors(self, gyro: F64, accel: F64 | None = None) -> None:
         """Add errors (rad/s, m/s²) to the samples: (3,), or (k, 3)."""
         accel = np.zeros(3) if accel is None else accel
         self.imu = replace(self.imu, gyro=self.imu.gyro + gyro, accel=self.imu.accel + accel)
@@ -57,27 +58,23 @@ class Moment:
 
 def rain(moment: Moment) -> None:
     """A fifth of all beams return from drops or dust within four metres, if nothing else is nearer."""
-    assert moment.scan is not None
     measured = np.linalg.norm(moment.scan.points, axis=1)
     drops = moment.rng.uniform(0.4, 4.0, len(measured))
     hit = (moment.rng.random(len(measured)) < 0.2) & (drops < measured)
-    moment.ranges(np.where(hit, drops, np.nan))
+    moment.change_ranges(np.where(hit, drops, np.nan))
 
 
 def strays(moment: Moment) -> None:
     """Three of a hundred ranges are arbitrary."""
-    assert moment.scan is not None
     stray = moment.rng.random(len(moment.scan)) < 0.03
-    moment.ranges(np.where(stray, moment.rng.uniform(0.4, 60.0, len(stray)), np.nan))
+    moment.change_ranges(np.where(stray, moment.rng.uniform(0.4, 60.0, len(stray)), np.nan))
 
 
 def every_tenth_scan_lost(moment: Moment) -> None:
-    if moment.index % 10 == 9:
-        moment.scan = None
+    moment.lost = moment.index % 10 == 9
 
 
 def half_of_the_packets_lost(moment: Moment) -> None:
-    assert moment.scan is not None
     packet = moment.scan.offsets_ns // PACKET_NS
     arrives = moment.rng.random(int(packet.max(initial=0)) + 1) < 0.5
     moment.scan = moment.scan.part(arrives[packet])
@@ -85,7 +82,6 @@ def half_of_the_packets_lost(moment: Moment) -> None:
 
 def quarter_of_each_scan_lost(moment: Moment) -> None:
     """All points of a quarter of the time of each scan, at another place in each."""
-    assert moment.scan is not None
     share = moment.scan.offsets_ns / max(int(moment.scan.offsets_ns.max(initial=0)), 1)
     begin = moment.rng.uniform(0.0, 0.75)
     moment.scan = moment.scan.part((share < begin) | (share > begin + 0.25))
@@ -93,13 +89,13 @@ def quarter_of_each_scan_lost(moment: Moment) -> None:
 
 def gyroscope_drifts(moment: Moment) -> None:
     """The bias changes by 0.012 rad/s within thirty seconds, more than that of a cold gyroscope that warms up."""
-    moment.add(np.array([0.005, -0.005, 0.01]) * min(moment.since_s / 30.0, 1.0))
+    moment.add_errors(np.array([0.005, -0.005, 0.01]) * min(moment.since_s / 30.0, 1.0))
 
 
 def noisy_imu(moment: Moment) -> None:
     """White noise of 0.05 rad/s and 0.5 m/s² on each sample, ten and more times that of a consumer IMU."""
     shape = moment.imu.gyro.shape
-    moment.add(0.05 * moment.rng.normal(size=shape), 0.5 * moment.rng.normal(size=shape))
+    moment.add_errors(0.05 * moment.rng.normal(size=shape), 0.5 * moment.rng.normal(size=shape))
 
 
 def coarse_imu(moment: Moment) -> None:
@@ -148,7 +144,7 @@ def with_fault(
         moment = Moment(measurement.scan, measurement.imu, index, since_s, rng)
         fault(moment)
         held = moment.imu if held is None else _joined(held, moment.imu)
-        if moment.scan is not None:
+        if not moment.lost:
             yield moment.scan, held
             held = None
 

@@ -92,7 +92,7 @@ def _results(client: Any, jobs: Sequence[Job], url: str, deaths: Counter[Path]) 
     """Yield jobs as they end, with the reason if they failed. Raises _Gone.
 
     Args:
-        deaths: of workers so far, by the folder of the job that they ran; counted on.
+        deaths: of workers so far, by the folder of the job that they ran. Further ones are added.
     """
     waiting, running = deque(jobs), dict[str, tuple[Job, Any]]()
     news = threading.Event()

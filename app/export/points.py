@@ -91,7 +91,7 @@ def _block(keyframe: Keyframe, T_map_odom: F64) -> Block:
     T = T_map_odom @ keyframe.T_odom_imu @ keyframe.T_imu_lidar
     points = np.empty((len(cloud), 3))
     transform(cloud.points, T, points)
-    # offsets count from the scan's end; in older stores from its begin, where the last point counts as the end
+    # offsets count from the scan's end; in older stores from its start, where the last point counts as the end
     begin_ns = keyframe.stamp_ns - int(cloud.offsets_ns.max(initial=0))
     stamps_ns = begin_ns + cloud.offsets_ns.astype(np.int64)
     return Block(keyframe.index, keyframe.stamp_ns, T, points, stamps_ns, cloud.labels, cloud.intensity, cloud.ring)

@@ -7,7 +7,7 @@ import numpy as np
 
 from app.georeference import crs
 from app.georeference.align import Alignment
-from app.georeference.fixes import Fixes, require_degrees
+from app.georeference.fixes import Fixes, require_degrees, without_jumps
 from app.georeference.ground import Ground
 from app.georeference.reference import ELLIPSOIDAL
 from app.georeference.tables import NamedColumns, table_of
@@ -74,8 +74,7 @@ def read_picks(table: NamedColumns) -> dict[str, F64]:
             f"{table.source} holds no picked points; its first line must name the columns name, x, y, z."
         )
     names = _names(table)
-    _refuse_gaps(table, "x", "y", "z")
-    return dict(zip(names, table.numbers("x", "y", "z"), strict=True))
+    return dict(zip(names, _complete(table, "x", "y", "z"), strict=True))
 
 
 def _left_open(names: list[str]) -> str:
@@ -91,41 +90,40 @@ def read_places(table: NamedColumns, grid: str = "") -> tuple[str, dict[str, F64
     Raises:
         HemislamError: it lacks the grid, or as `sound_places`.
     """
-    columns, numbers = sound_places(table)
+    columns, names, numbers = sound_places(table)
     if columns == _EASTINGS:
         if not grid:
             raise HemislamError(f"{table.source} holds eastings and northings; say of which grid: EPSG:CODE.")
         crs.projected(grid)
     else:
-        latitude, longitude, height = numbers.T
-        turned = np.column_stack([latitude, np.unwrap(longitude, period=360.0), height])
-        ground = Ground.of(Fixes.of(np.zeros(len(turned)), turned), grid)
+        ground = Ground.of(Fixes.of(np.zeros(len(numbers)), without_jumps(numbers)), grid)
         grid, numbers = ground.centre.crs, ground.grid
-    return grid, dict(zip(table.columns["name"], numbers, strict=True))
+    return grid, dict(zip(names, numbers, strict=True))
 
 
-def sound_places(table: NamedColumns) -> tuple[tuple[str, str, str], F64]:
-    """The columns of the places, and (n, 3) their numbers.
+def sound_places(table: NamedColumns) -> tuple[tuple[str, str, str], list[str], F64]:
+    """The columns of the coordinates, the names of the control points, and their coordinates (n, 3).
 
     Raises:
         HemislamError: a row is not a control point on Earth with a name of its own and all coordinates.
     """
-    columns, _ = _coordinates(table), _names(table)
-    _refuse_gaps(table, *columns)
-    numbers = table.numbers(*columns)
+    columns, names = _coordinates(table), _names(table)
+    numbers = _complete(table, *columns)
     if columns == _DEGREES:
         require_degrees(numbers, table.source, "row")
-    return columns, numbers
+    return columns, names, numbers
 
 
-def _refuse_gaps(table: NamedColumns, *columns: str) -> None:
-    """Raises HemislamError unless every row has a number in each of these columns."""
-    for row, place in enumerate(table.numbers(*columns), 1):
+def _complete(table: NamedColumns, *columns: str) -> F64:
+    """(n, k) numbers in these columns. Raises HemislamError: a row lacks one."""
+    numbers = table.numbers(*columns)
+    for row, place in enumerate(numbers, 1):
         for column, number in zip(columns, place.tolist(), strict=True):
             if not np.isfinite(number):
                 raise HemislamError(
                     f"{table.source}, row {row}: the {column} is missing; fill it in or remove the row."
                 )
+    return numbers
 
 
 def _coordinates(table: NamedColumns) -> tuple[str, str, str]:

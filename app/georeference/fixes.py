@@ -41,14 +41,18 @@ class Fixes(Samples):
         if len(order) < 3:
             raise HemislamError(f"{source} holds {len(order)} fixes with a position; at least 3 are needed.")
         require_degrees(self.places, source, "fix")
-        latitude, longitude, height = self.places[order].T
-        places = np.column_stack([latitude, np.unwrap(longitude, period=360.0), height])
         sigmas = np.where(np.isfinite(self.sigmas) & (self.sigmas > 0), self.sigmas, np.nan)
-        return Fixes(self.stamps_ns[order], places, sigmas[order])
+        return Fixes(self.stamps_ns[order], without_jumps(self.places[order]), sigmas[order])
+
+
+def without_jumps(places: F64) -> F64:
+    """Places (n, 3) in degrees and m with longitudes that do not jump from 180° to -180°."""
+    latitude, longitude, height = places.T
+    return np.column_stack([latitude, np.unwrap(longitude, period=360.0), height])
 
 
 def require_degrees(places: F64, source: str, kind: str) -> None:
-    """Raises HemislamError: a latitude or longitude, degrees, is beyond its range. kind: what a row is called."""
+    """Raises HemislamError: a latitude or longitude (degrees) is beyond its range. kind: what a row is called."""
     latitude, longitude = np.abs(places[:, :2]).T
     if not (latitude <= 90).any() and (latitude > 90).any() and not (longitude > 90).any():
         raise HemislamError(

@@ -28,7 +28,7 @@ class _Sentence:
         at_ns: time of the day.
         place: latitude and longitude in degrees, height above the geoid, and the geoid's height above the ellipsoid
             (nan if not stated), m.
-        sigmas: of the place at the same time, m to the east, north and up. day_ns: the begin of the day.
+        sigmas: of the place at the same time, m to the east, north and up. day_ns: the start of the day.
     """
 
     at_ns: int

@@ -249,7 +249,7 @@ def _open_capture(path: Path) -> CaptureStream | OusterStream:
         raise HemislamError(f"{path} is not a network capture ({error}); hemislam reads {_KINDS}.") from None
     if stream.shortened and all(kind == IMU for kind, _ in stream.counts.values()):
         raise HemislamError(
-            f"{path} holds only the begin of each packet; capture them whole, as `tcpdump -s 0 -w walk.pcap` does."
+            f"{path} holds only the beginning of each packet; capture them whole, as `tcpdump -s 0 -w walk.pcap` does."
         )
     if not stream.counts:
         beside = path.with_suffix(".json")

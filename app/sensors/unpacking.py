@@ -97,7 +97,7 @@ def _message_or_nothing(data: bytes) -> bytes:
 def _messages_or_nothing(
     chunk: storage_mcap.ChunkInfo, connections: dict[int, Any], start_ns: int, stop_ns: int, file: Any
 ) -> Iterator[storage_mcap.Msg]:
-    """The messages of a chunk of an MCAP by time; if it is damaged, empty ones at its begin, even before `start_ns`."""
+    """The messages of a chunk of an MCAP by time; if it is damaged, empty ones at its start, even before `start_ns`."""
     try:
         yield from _READ_CHUNK(chunk, connections, start_ns, stop_ns, file)
     except OSError:

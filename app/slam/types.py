@@ -62,7 +62,7 @@ class Scan:
         columns = (self.offsets_ns, self.intensity, self.ring, self.truth_ground)
         shapes = [array.shape for array in (self.points, *columns) if array is not None]
         count = len(self.points)
-        if shapes != [(count, 3), *[(count,)] * (len(shapes) - 1)]:  # the kernels do not look
+        if shapes != [(count, 3), *[(count,)] * (len(shapes) - 1)]:  # kernels check no bounds
             raise ValueError(
                 f"a scan has points (n, 3), and offsets_ns, intensity and ring (n,), but these are {shapes}"
             )

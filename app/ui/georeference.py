@@ -127,7 +127,7 @@ class GeoreferencePanel:
         if len(content) > _MOST_BYTES:
             raise HemislamError(f"A table of control points may have at most {_MOST_BYTES >> 10} kB.")
         text = content.decode("utf-8-sig", errors="replace")
-        sound_places(control_table(text))
+        sound_places(control_table(text))  # refused here, and not only when it is used
         self._control = text
         self._show_widgets()
 

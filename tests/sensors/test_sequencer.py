@@ -149,7 +149,7 @@ def test_a_scan_sent_again_with_a_slightly_later_stamp_is_dropped() -> None:
 
 
 def told(entries: Sequence[Measurement | DroppedScan]) -> dict[int, tuple[str, ...]]:
-    """What is noted, by the begin of the scan in ms."""
+    """What is noted, by the start of the scan in ms."""
     used = [entry for entry in entries if isinstance(entry, Measurement)]
     return {entry.scan.stamp_ns // MS: entry.notices for entry in used if entry.notices}
 

@@ -65,7 +65,7 @@ class Capture:
 
     Attributes:
         complete: False once the end was found to be in the middle of a frame.
-        shortened: True once a frame was found of which only the begin was captured.
+        shortened: True once a frame was found of which only the beginning was captured.
     """
 
     def __init__(self, path: Path) -> None:

@@ -288,7 +288,7 @@ def test_packets_that_are_not_captured_whole_are_named(tmp_path: Path, kind: str
     """200 bytes hold the IMU's."""
     path = tmp_path / f"walk.{kind}"
     path.write_bytes((captures.pcap if kind == "pcap" else captures.pcapng)(walk(), most=most))
-    with pytest.raises(HemislamError, match="only the begin of each packet; capture them whole"):
+    with pytest.raises(HemislamError, match="only the beginning of each packet; capture them whole"):
         open_recording(path, Params())
 
 
