@@ -91,8 +91,8 @@ def find_leaps(
         steps = [_greatest_steps(times, before_ns, after_ns) for times in topics]
         log_ns = min((log.by_ns for _, log in steps), key=abs)
         # what a topic was silent for beyond the other one, as while its sensor started anew, is no leap
-        (of_scans, log_of_scans), *_ = steps = [(_without(own, log.by_ns - log_ns), log) for own, log in steps]
-        of_samples, log = steps[-1]
+        steps = [(_without(own, log.by_ns - log_ns), log) for own, log in steps]
+        (of_scans, log_of_scans), (of_samples, log) = steps[0], steps[-1]
         # what is the same in all is due to messages that were lost meanwhile
         lost_ns = min((of_scans.by_ns, of_samples.by_ns, log_ns), key=abs)
         if abs(lost_ns) < JITTER_NS or (lost_ns > AROUND_NS and continues(before_ns, after_ns)):
