@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from app.slam import lie
-from app.slam.kernels import manifold
+from app.slam.kernels import manifold, submaps
 from app.slam.kernels.small import plane_of
 
 from .test_lie import directions, rotvecs
@@ -100,3 +101,11 @@ def test_points_all_in_one_place_have_a_unit_normal_anyway() -> None:
     normal = np.full(3, np.nan)
     assert plane_of(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, normal) == (0.0, 0.0, 0.0)
     assert np.linalg.norm(normal) == pytest.approx(1.0)
+
+
+@given(st.integers(0, 99), st.integers(1, 3))
+def test_peaks_are_those_of_scipys_maximum_filter(seed: int, reach: int) -> None:
+    values = np.random.default_rng(seed).integers(1, 20, (6, 9, 12)).astype(np.float32)
+    places = np.argwhere(values > 4)
+    peaks = values == ndimage.maximum_filter(values, 2 * reach + 1, mode="constant")
+    np.testing.assert_array_equal(submaps.highest(values, places, reach), peaks[tuple(places.T)])

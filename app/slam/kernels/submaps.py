@@ -42,6 +42,23 @@ def columns(points, level, upright, yaw, position, cell, bare, tallest, plan):
 
 
 @njit(cache=True)
+def highest(values, places, reach):
+    """(n,) bool: at which of some places no value up to `reach` further along the axes is higher.
+
+    values (a, b, c) f32; places (n, 3) i64: indices into them.
+    """
+    out = np.ones(len(places), np.bool_)
+    for index in range(len(places)):
+        i, j, k = places[index, 0], places[index, 1], places[index, 2]
+        around = values[max(i - reach, 0) : i + reach + 1, max(j - reach, 0) : j + reach + 1]
+        for value in around[:, :, max(k - reach, 0) : k + reach + 1].flat:
+            if value > values[i, j, k]:
+                out[index] = False
+                break
+    return out
+
+
+@njit(cache=True)
 def normal_equations(
     moved, normals, R, origin, partner, squared, there, their_normals, flat, reach, facing, scale, H, b, residuals
 ):

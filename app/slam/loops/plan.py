@@ -8,7 +8,7 @@ Registration begins at the best few.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, ndimage
+from scipy import fft
 
 from app.slam import lie
 from app.slam.kernels import submaps
@@ -54,10 +54,11 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     alike = np.empty((len(yaws), len(shifts), len(shifts)), np.float32)
     for index, yaw in enumerate(yaws):
         turned = fft.rfft2(_plan(source, yaw, T_guess[:3, 3], cells))
-        alike[index] = fft.irfft2(spectrum * turned.conj(), (cells, cells))[np.ix_(shifts, shifts)]
+        rows = fft.ifft(spectrum * turned.conj(), axis=0, overwrite_x=True)[shifts]
+        alike[index] = fft.irfft(rows, cells)[:, shifts]
     alike[:, np.hypot(shifts[:, None], shifts) > reach] = 0.0
-    highest = ndimage.maximum_filter(alike, SAME, mode="constant")  # type: ignore[attr-defined]  # no types
-    found = np.argwhere((alike >= highest) & (alike > LEAST * alike.max()))
+    found = np.argwhere(alike > LEAST * alike.max())
+    found = found[submaps.highest(alike, found, SAME // 2)]
     best = found[np.argsort(-alike[tuple(found.T)], kind="stable")[:PEAKS]]
     moves = CELL_M * np.column_stack([best[:, 1:] - reach, np.zeros(len(best))])
     return [
