@@ -73,6 +73,16 @@ class RestartLimit:
         return len(self._deaths) <= self.most or self._deaths[-1] - self._deaths[0] >= self._within_s
 
 
+def put(connection: "Connection[Any, Any]", message: object) -> None:
+    """Send a message to `take`, which leaves read-only arrays read-only, unlike the connection's own method."""
+    connection.send_bytes(pickle.dumps(message, protocol=5))
+
+
+def take(connection: "Connection[Any, Any]") -> Any:
+    """Wait for the next message of `put`. Raises EOFError or OSError: the other end is gone."""
+    return pickle.loads(connection.recv_bytes())
+
+
 class Link:
     """One end of the connection between an owner and its child. Any thread may send; one at a time may receive."""
 
@@ -113,7 +123,7 @@ class Link:
     def _write(self) -> None:
         try:
             while (message := self._unsent.get()) is not _END:
-                self._connection.send_bytes(pickle.dumps(message, protocol=5))
+                put(self._connection, message)
             self._connection.send_bytes(b"")
         except OSError:
             pass  # the other end is gone, which `receive` reports

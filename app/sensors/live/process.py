@@ -19,7 +19,7 @@ from multiprocessing.connection import Client, Connection
 from pathlib import Path
 from typing import Any
 
-from app.child import Child, ChildDied, Link, RestartLimit
+from app.child import Child, ChildDied, Link, RestartLimit, put, take
 from app.sensors.live.address import ENDED, TITLE, LiveAddress
 from app.sensors.live.source import Event, Known
 from app.sensors.live.status import LiveState
@@ -179,8 +179,8 @@ class LiveClient:
         try:
             if self._connection is None:
                 self._connection = Client(self._address.path, authkey=self._address.key)
-            self._connection.send(request)
-            return self._connection.recv()
+            put(self._connection, request)
+            return take(self._connection)
         except (OSError, EOFError):
             self.close()
             self._connection = None

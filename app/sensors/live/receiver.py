@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection, Listener
 from pathlib import Path
 from typing import Any, Final
 
-from app.child import Link
+from app.child import Link, put, take
 from app.sensors.live.address import LiveAddress
 from app.sensors.live.source import Event, Known, LiveSource
 from app.sensors.live.urls import open_live
@@ -98,7 +98,7 @@ class ScanServer:
         """Answer a client until it leaves or dies."""
         with contextlib.suppress(OSError, EOFError), connection:
             while True:
-                connection.send(self._answer(*connection.recv()))
+                put(connection, self._answer(*take(connection)))
 
     def known(self) -> Known:
         """The state of the source."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.child import put
 from app.sensors.live.process import LiveClient, LiveProcess
 from app.sensors.recording import open_recording
 from app.slam.errors import HemislamError
@@ -44,7 +45,7 @@ def test_an_engine_that_dies_is_followed_by_one_that_misses_nothing(tmp_path: Pa
         before = take(first, 12)
         checkpoint = first.place
         take(first, 8)
-        first._connection.send(("poll", first.place, 5.0))  # and dies before the answer
+        put(first._connection, ("poll", first.place, 5.0))  # and dies before the answer
         first.close()
         feeder.join(20.0)
         time.sleep(0.3)  # nearly forty scans have come meanwhile
@@ -59,6 +60,8 @@ def test_an_engine_that_dies_is_followed_by_one_that_misses_nothing(tmp_path: Pa
     whole = [*before, *after]
     turns = [round((m.scan.stamp_ns - sensor.START_NS) / (1801 * 55_520)) for m in whole]
     assert turns == list(range(58))
+    arrays = [array for m in whole for array in (m.scan.points, m.scan.ring, m.imu.gyro)]
+    assert not any(array.flags.writeable for array in arrays), "else kernels are compiled for them once more"
     for one, following in pairwise(whole):
         assert following.imu.stamps_ns[0] <= one.scan.end_ns <= following.imu.stamps_ns[1]
     with open_recording(record, Params()) as recording:
