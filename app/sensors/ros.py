@@ -6,6 +6,7 @@ known) and the absolute time of each point. Their stamp is the time of the last 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, BinaryIO, Final
 
 import numpy as np
@@ -24,7 +25,6 @@ ENCODINGS: Final = {"cdr": "ros2msg", "ros1": "ros1msg"}
 """Message encodings that can be read, with the format of their definitions."""
 _STORES: Final = {"cdr": Stores.ROS2_HUMBLE, "ros1": Stores.ROS1_NOETIC}
 
-_ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
 """PointField.datatype as numpy's; 9 and 10 (64-bit integers) are an extension that some drivers use."""
 _DATATYPE_OF = {np.dtype(kind): number for number, kind in DATATYPES.items()}
@@ -49,13 +49,13 @@ class Deserialiser:
     """Reads messages of the standard types, and of those whose definitions it was given."""
 
     def __init__(self) -> None:
-        self._stores: dict[str, Typestore] = {}
+        self._learnt: dict[str, Typestore] = {}  # by encoding
 
     def learn(self, kind: str, definition: str, encoding: str) -> None:
         """Read messages of this type too; a definition that makes no sense is ignored."""
         if not definition or encoding not in ENCODINGS or self.knows(kind, encoding):
             return
-        store = self._store(encoding)
+        store = self._learnt.setdefault(encoding, get_typestore(_STORES[encoding]))
         try:
             found = get_types_from_msg(definition, kind)
             store.register({name: fields for name, fields in found.items() if name not in store.types})
@@ -64,21 +64,26 @@ class Deserialiser:
 
     def knows(self, kind: str, encoding: str) -> bool:
         """Whether messages of this type can be read."""
-        return encoding in ENCODINGS and (kind in CUSTOM_MSGS or kind in self._store(encoding).types)
+        return encoding in ENCODINGS and (kind in CUSTOM_MSGS or kind in self._store(kind, encoding).types)
 
     def read(self, data: bytes, kind: str, encoding: str) -> Any:
         """The message. Raises whatever the library raises for bytes that are not such a message."""
         if kind in CUSTOM_MSGS:
             return CustomMsg.of(data, encoding)
-        store = self._store(encoding)
+        store = self._store(kind, encoding)
         view = memoryview(data)  # the library slices this; slices of bytes would copy every cloud
         return store.deserialize_ros1(view, kind) if encoding == "ros1" else store.deserialize_cdr(view, kind)
 
-    def _store(self, encoding: str) -> Typestore:
-        """The types of an encoding, loaded when first needed, since this takes a tenth of a second."""
-        if encoding not in self._stores:
-            self._stores[encoding] = get_typestore(_STORES[encoding])
-        return self._stores[encoding]
+    def _store(self, kind: str, encoding: str) -> Typestore:
+        standard = _standard(encoding)
+        return standard if kind in standard.types else self._learnt.get(encoding, standard)
+
+
+@cache
+def _standard(encoding: str) -> Typestore:
+    """The standard types of an encoding. All share them, since a store writes the code that reads a type on first use,
+    which takes some 40 ms."""
+    return get_typestore(_STORES[encoding])
 
 
 def brief(error: BaseException) -> str:
@@ -114,7 +119,7 @@ def imu_values(message: Any) -> tuple[Vector, Vector]:
 
 def new(kind: str, **fields: Any) -> Any:
     """A message of a standard type."""
-    return _ROS2.types[kind](**fields)
+    return _standard("cdr").types[kind](**fields)
 
 
 def cloud_message(scan: Scan, *, exact: bool = False, stamp_ns: int | None = None, frame: str = "rslidar") -> Any:
@@ -185,14 +190,14 @@ def serialised(message: Any) -> bytes:
     """As CDR, which ROS 2 sends and records."""
     if isinstance(message, CustomMsg):
         return message.cdr()
-    return bytes(_ROS2.serialize_cdr(message, message.__msgtype__))
+    return bytes(_standard("cdr").serialize_cdr(message, message.__msgtype__))
 
 
 def definition(kind: str) -> str:
     """The type's text, with the types that it contains."""
     if kind in CUSTOM_MSGS:
         return livox.definition(kind)
-    return str(_ROS2.generate_msgdef(kind)[0])
+    return str(_standard("cdr").generate_msgdef(kind)[0])
 
 
 @dataclass(frozen=True, slots=True)

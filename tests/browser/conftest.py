@@ -158,13 +158,12 @@ def chromium() -> Iterator[Browser]:
         browser.close()
 
 
-def new_page(chromium: Browser, width: int, height: int, *, tour: bool = False, coarse: bool = True) -> Page:
+def new_page(chromium: Browser, width: int, height: int, *, tour: bool = False) -> Page:
     """A page on which an error or a warning of our own fails the test. tour: as on a first visit."""
     page = chromium.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(SLOW_MS)
     page.add_init_script(AT_TEN_FRAMES_A_SECOND)
-    if coarse:
-        page.add_init_script(COARSE)
+    page.add_init_script(COARSE)
     if not tour:
         page.add_init_script("localStorage.setItem('hemislam-tour', 'seen')")
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -188,19 +187,17 @@ def opened(
     width: int,
     height: int,
     camera: tuple[Any, Any] | None = None,
-    *,
-    coarse: bool = True,
 ) -> Iterator[Bench]:
     """A workbench on an engine, which stays the caller's, and its page, ready to be clicked.
 
     Args:
-        camera: where it is at first, and what it looks at. coarse: draw in large pixels, which takes less time.
+        camera: where it is at first, and what it looks at.
     """
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     forks = engine if isinstance(engine, Workspace) else alone(engine)
     workbench = Workbench(server, forks, Folders([folder]))
     workbench.start()
-    page = new_page(chromium, width, height, coarse=coarse)
+    page = new_page(chromium, width, height)
     url = f"http://127.0.0.1:{server.get_port()}/"
     page.goto(url)
     expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()

@@ -26,7 +26,7 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
 
 @pytest.fixture(scope="module")
 def bench(chromium: Browser, forks: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with opened(chromium, forks, tmp_path_factory.mktemp("recordings"), 1280, 900, coarse=False) as bench:
+    with opened(chromium, forks, tmp_path_factory.mktemp("recordings"), 1280, 900) as bench:
         yield bench
 
 

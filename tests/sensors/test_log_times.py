@@ -13,7 +13,7 @@ from app.slam.types import Measurement
 from tests.sensors import rig
 
 S = 1_000_000_000
-TURNS = 240
+TURNS = 160
 LAYOUT = rig.Layout(absolute=False, fields=rig.RELATIVE, header="first")
 Wrong = list[tuple[str, float, int]]
 """Topic, place among its messages, 0-1, and by how many seconds its log time is wrong."""
