@@ -77,7 +77,7 @@ def test_one_iteration_is_the_textbook_kalman_update(room: LocalMap, extrinsics:
     A residual over RESIDUAL_HUBER standard deviations counts as noisier, so that it pulls as one at that limit would.
     """
     params = FilterParams(max_iterations=1, estimate_extrinsics=extrinsics)
-    prior, points = correlated_prior(1e-2), points_of(furnished_room())
+    prior, points = correlated_prior(1e-2), points_of(furnished_room())[::2].copy()
     problem = Problem(room, prior, points, params)
     free = slice(0, DIM if extrinsics else 17)
     H, P, w = problem.jacobian(prior.state)[:, free], prior.covariance[free, free], problem.weights(prior.state)

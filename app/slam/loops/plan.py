@@ -46,6 +46,7 @@ EVERYWHERE = Window(FARTHEST_M, np.pi)
 def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window) -> list[F64]:
     """Alignments (4, 4) T_target_source of the level frames from which to register, the likeliest first."""
     steps = min(int(np.ceil(window.turn / TURN)), round(np.pi / TURN))
+    position = T_guess[:3, 3].copy()
     yaws = np.arctan2(T_guess[1, 0], T_guess[0, 0]) + np.arange(-steps, steps + 1) * TURN
     reach = int(np.ceil(min(window.reach_m, FARTHEST_M) / CELL_M))
     shifts = np.arange(-reach, reach + 1)
@@ -53,7 +54,7 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     spectrum = fft.rfft2(_plan(target, 0.0, np.zeros(3), cells))
     alike = np.empty((len(yaws), len(shifts), len(shifts)), np.float32)
     for index, yaw in enumerate(yaws):
-        turned = fft.rfft2(_plan(source, yaw, T_guess[:3, 3], cells))
+        turned = fft.rfft2(_plan(source, yaw, position, cells))
         rows = fft.ifft(spectrum * turned.conj(), axis=0, overwrite_x=True)[shifts]
         alike[index] = fft.irfft(rows, cells)[:, shifts]
     alike[:, np.hypot(shifts[:, None], shifts) > reach] = 0.0
@@ -62,7 +63,7 @@ def placements(target: Prepared, source: Prepared, T_guess: F64, window: Window)
     best = found[np.argsort(-alike[tuple(found.T)], kind="stable")[:PEAKS]]
     moves = CELL_M * np.column_stack([best[:, 1:] - reach, np.zeros(len(best))])
     return [
-        _on_ground(target, source, _upright(yaws[k], T_guess[:3, 3] + shift), cells)
+        _on_ground(target, source, _upright(yaws[k], position + shift), cells)
         for k, shift in zip(best[:, 0], moves, strict=True)
     ]
 

@@ -137,7 +137,7 @@ def paused(
 def test_loops_tie_the_parts_of_a_walk_that_was_paused(walked: Walked, moved: tuple[float, float, float]) -> None:
     """Whether the walker came back to where the pause began or went on meanwhile."""
     keyframes, at = walked.walk.drifted(0.003, 0.005)[: LAP + 30], 60
-    backend = drive(tuple(paused(keyframes, at, 15.0, moved)), FINER)
+    backend = drive(tuple(paused(keyframes, at, 15.0, moved)), PARAMS)
     across = [edge for edge in accepted(backend) if edge.older < at <= edge.newer]
     assert len(across) > 5
     assert max(error(edge, walked.walk.truth)[0] for edge in across) < 0.3
