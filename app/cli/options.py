@@ -114,7 +114,13 @@ def say_calibrated(recording: Path) -> None:
 
 
 class ParamsFor(Protocol):
-    """Gives the parameters of a recording. Raises HemislamError as `resolve`."""
+    """Gives the parameters of a recording. Raises HemislamError as `resolve`.
+
+    Attributes:
+        keywords: the values of the options, by name; None or empty without the option.
+    """
+
+    keywords: dict[str, Any]
 
     def __call__(self, recording: Path | None, *, calibrated: bool = True) -> "Params": ...
 

@@ -126,6 +126,9 @@ def serve(
     if session is not None and (start or duration is not None or truth is not None):
         raise HemislamError("--start, --duration and --truth belong to a recording; a session file has its own.")
     params = session.state.params if session else params_for(recording)
+    if session is not None and any(params_for.keywords.values()):
+        params_for(None)  # raises for a misspelt one
+        typer.echo("The session keeps its own parameters; those given here hold for recordings that are opened later.")
     if recording is not None:
         opened = session.opened.recording if session else recording
         say_calibrated(opened)

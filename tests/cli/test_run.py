@@ -171,6 +171,18 @@ def test_serve_refuses_an_option_that_a_session_would_ignore(
     assert "belong to a recording" in hemislam("serve", session, option).refused()
 
 
+def test_serve_says_that_a_session_keeps_its_own_parameters(
+    hemislam: Call, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, served = tmp_path / "short.hemislam", list[Any]()
+    write_session(session, SavedSession(Opened(walk, nbytes=size_of(walk)), State(Params()), 3))
+    monkeypatch.setattr("app.server.web.run_server", lambda setup, **_: served.append(setup))
+    assert "its own parameters" in hemislam("serve", session, "--set", "ground.alpha=40").out
+    assert "its own parameters" not in hemislam("serve", session).out
+    assert [setup.params for setup in served] == [Params()] * 2
+    assert "ground.alfa" in hemislam("serve", session, "--set", "ground.alfa=40").refused()
+
+
 def test_a_recording_whose_imu_is_silent_is_mapped_by_the_lidar_alone_and_says_so(
     hemislam: Call, walk_without: Callable[[float], Path], tmp_path: Path
 ) -> None:
