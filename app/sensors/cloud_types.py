@@ -24,6 +24,9 @@ FARTHEST_M = 10_000.0
 LATEST = 1e19
 """Largest time of a point, in any unit: years in ns. Beyond it, integers overflow."""
 
+JOINED = " + "
+"""Between the names of two integer fields that only together are a time: seconds, and the nanoseconds after them."""
+
 _LIVOX = {"tag", "line"}
 """Fields of clouds of the Livox drivers, as `CustomMsg` and as PointCloud2."""
 
@@ -55,7 +58,13 @@ class CloudMessage:
         return self.height * self.width
 
     def column(self, name: str) -> Column:
-        """(n,) values of one field in its own type, native byte order. Raises CloudError if absent."""
+        """(n,) values of one field in its own type, native byte order. Raises CloudError if absent.
+
+        Of two fields whose names are `JOINED`: int64 ns.
+        """
+        seconds, joined, nanoseconds = name.partition(JOINED)
+        if joined and name not in self.fields:
+            return self.column(seconds).astype(np.int64) * 1_000_000_000 + self.column(nanoseconds).astype(np.int64)
         if name not in self.fields:
             raise CloudError(f"the cloud has no field `{name}` (it has {', '.join(self.fields) or 'none'})")
         offset, dtype = self.fields[name]

@@ -5,13 +5,14 @@ against two facts: a scan lasts about as long as the interval to the next one, a
 message was logged.
 """
 
+import re
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from app.sensors.cloud_types import CloudType, Probe
+from app.sensors.cloud_types import JOINED, CloudType, Probe
 from app.sensors.findings import Finding, FindingVerdict
 from app.slam.sections import RecordingParams
 from app.slam.types import I64
@@ -21,6 +22,8 @@ LONGEST = 5.0
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 MOST_NS = 2**61
 """Times more than 73 years after others are limited to this, so that integers can hold them."""
+_SECONDS = ("sec", "s", "secs", "second", "seconds")
+_NANOSECONDS = re.compile(rf"(.*?)(?:n|nano)(?:{'|'.join(_SECONDS)})")
 
 Anchor = Literal["absolute", "header", "first", "last"]
 End = Literal["first", "last"]
@@ -79,7 +82,19 @@ def _candidates(probe: Probe, kind: CloudType, wanted: str) -> list[str]:
         return [wanted]
     lower = {name.lower(): name for name in probe.cloud.fields}
     usual = [lower[name] for name in kind.times if name in lower]
-    return usual + [lower[name] for name in lower if ("time" in name or "stamp" in name) and lower[name] not in usual]
+    others = [lower[name] for name in lower if ("time" in name or "stamp" in name) and lower[name] not in usual]
+    return [*_seconds_and_nanoseconds(probe, lower), *usual, *others]
+
+
+def _seconds_and_nanoseconds(probe: Probe, lower: dict[str, str]) -> list[str]:
+    """The joined names of two fields such as `timestampSec` and `timestampNsec`. lower: names by their lower case."""
+    for name in lower:
+        if found := _NANOSECONDS.fullmatch(name):
+            pair = [*[lower[one] for unit in _SECONDS if (one := found[1] + unit) in lower][:1], lower[name]]
+            integers = all(probe.cloud.fields[one][1].kind in "iu" for one in pair)
+            if len(pair) == 2 and integers and probe.column(pair[1]).max() < 1_000_000_000:
+                return [JOINED.join(pair)]
+    return []
 
 
 def _settle_unit(

@@ -68,7 +68,8 @@ def turn(number: int = 0, columns: int = 90, *, clockwise: bool = True, channels
 class Layout:
     """How a driver packs a revolution into a PointCloud2 message.
 
-    `fields`: (name, type, source) in order; `source` is x, y, z, intensity, ring, ground, or time.
+    `fields`: (name, type, source) in order; `source` is x, y, z, intensity, ring, ground, time, or the
+    time's seconds or nanoseconds.
     """
 
     fields: list[tuple[str, str, str]] = field(
@@ -131,6 +132,8 @@ def message(turned: Turn, layout: Layout | None = None, ros: int = 2, lost: Iter
                 value = float("nan") if slot in missing else float(turned.points[slot]["xyz".index(source)])
             elif source == "time":
                 value = time_ns / layout.unit_ns if kind[0] == "f" else time_ns // layout.unit_ns
+            elif source in ("seconds", "nanoseconds"):
+                value = divmod(time_ns, 10**9)[source == "nanoseconds"]
             else:
                 value = getattr(turned, source)[slot]
             struct.pack_into(order + FORMATS[kind], data, at + offset, float(value) if kind[0] == "f" else int(value))

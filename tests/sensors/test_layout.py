@@ -125,6 +125,32 @@ def test_a_simulator_clock_that_starts_at_zero_is_absolute() -> None:
     assert "absolute" in findings["time reference"].text
 
 
+@pytest.mark.parametrize(
+    "names", [("timestampSec", "timestampNsec"), ("t_s", "t_ns"), ("sec", "nanosec"), ("time_seconds", "time_nanosecs")]
+)
+def test_a_time_in_two_fields_is_put_together_also_in_a_scan_that_crosses_a_full_second(names: tuple[str, str]) -> None:
+    layout = rig.Layout([*XYZ, RING, (names[1], "u4", "nanoseconds"), (names[0], "u4", "seconds")])
+    turns = [rig.turn(number, columns=20) for number in range(4)]
+    for number, made in enumerate(turns, -1):
+        made.begin_ns = rig.START_NS + number * rig.PERIOD_NS - 30_000_000  # the second one crosses a full second
+    probes = [Probe(m.begin_ns + rig.PERIOD_NS, read_point_cloud_2(rig.message(m, layout))) for m in turns]
+    settled, findings = settle(probes)
+    for probe, made in zip(probes, turns, strict=True):
+        scan = decode(probe.cloud, settled)
+        np.testing.assert_array_equal(scan.stamp_ns + scan.offsets_ns.astype(np.int64), made.begin_ns + made.offsets_ns)
+    assert f"`{names[0]} + {names[1]}` (int64) in ns" in findings["point time"].text
+    assert "absolute" in findings["time reference"].text
+
+
+def test_seconds_and_nanoseconds_that_are_the_same_time_twice_are_not_added() -> None:
+    layout = rig.Layout([*XYZ, RING, ("time_s", "f8", "time"), ("time_ns", "f8", "more")])
+    turns = [rig.turn(number, columns=20) for number in range(4)]
+    for made in turns:
+        made.more = made.offsets_ns  # type: ignore[attr-defined]
+    settled, _ = settle([Probe(m.begin_ns + rig.PERIOD_NS, read_point_cloud_2(rig.message(m, layout))) for m in turns])
+    assert settled.timing.field == "time_s"
+
+
 def test_absolute_time_in_a_float32_is_refused_and_derived_from_the_azimuth() -> None:
     layout = rig.Layout([*XYZ, RING, ("timestamp", "f4", "time")])
     probes = clouds(layout)
