@@ -29,12 +29,14 @@ class Stroke:
     Attributes:
         stamp_ns: of the frame. count: of points in its cloud. mark: GROUND, NON_GROUND or UNMARKED, which erases.
         touched: a bit for each point of the cloud, in its order, packed by `numpy.packbits`.
+        joined: whether it was made by one action with the stroke before it; they are undone together.
     """
 
     stamp_ns: int
     count: int
     mark: int
     touched: bytes
+    joined: bool = False
 
     @classmethod
     def of(cls, stamp_ns: int, touched: npt.NDArray[np.bool_], mark: int) -> "Stroke":
@@ -60,6 +62,11 @@ def marks(strokes: Iterable[Stroke]) -> dict[int, U8]:
     return {stamp: found[stamp] for stamp in sorted(found) if (found[stamp] != UNMARKED).any()}
 
 
+def undone(strokes: tuple[Stroke, ...]) -> tuple[Stroke, ...]:
+    """The strokes without those of the last action."""
+    return strokes[: max((place for place, stroke in enumerate(strokes) if not stroke.joined), default=0)]
+
+
 def strokes_of(found: dict[int, U8]) -> tuple[Stroke, ...]:
     """The fewest strokes that leave these marks."""
     return tuple(
@@ -74,7 +81,8 @@ def entry_of(stroke: Stroke) -> dict[str, Any]:
     """A stroke as JSON holds it."""
     mark = next(name for name, value in _MARKS.items() if value == stroke.mark)
     touched = b64encode(zlib.compress(stroke.touched)).decode()
-    return {"stamp_ns": stroke.stamp_ns, "points": stroke.count, "mark": mark, "touched": touched}
+    entry = {"stamp_ns": stroke.stamp_ns, "points": stroke.count, "mark": mark, "touched": touched}
+    return entry | ({"joined": True} if stroke.joined else {})
 
 
 def stroke_of(entry: dict[str, Any]) -> Stroke:
@@ -83,7 +91,7 @@ def stroke_of(entry: dict[str, Any]) -> Stroke:
     packed = zlib.decompressobj().decompress(b64decode(entry["touched"]), max(count, 0) // 8 + 2)
     if len(packed) != -(-count // 8):
         raise ValueError(f"{count} points have another number of bits")
-    return Stroke(int(entry["stamp_ns"]), count, _MARKS[entry["mark"]], packed)
+    return Stroke(int(entry["stamp_ns"]), count, _MARKS[entry["mark"]], packed, entry.get("joined") is True)
 
 
 def to_json(strokes: Iterable[Stroke]) -> str:

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from app.mapping.kept import Kept, KeptView, Measure, Note
-from app.mapping.painted import Stroke
+from app.mapping.painted import Stroke, undone
 from app.server.protocol import Command
 from app.slam.errors import HemislamError
 
@@ -67,7 +67,7 @@ class Paint(KeptCommand, frozen=True):
 
 
 class UndoPaint(KeptCommand, frozen=True):
-    """Undo the last `Paint`."""
+    """Undo the last `Paint`, with those that it is joined to."""
 
 
 def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
@@ -107,5 +107,5 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
         case Paint(stroke):
             return replace(kept, painted=(*kept.painted, stroke))
         case UndoPaint():
-            return replace(kept, painted=kept.painted[:-1])
+            return replace(kept, painted=undone(kept.painted))
     return kept

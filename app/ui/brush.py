@@ -1,5 +1,6 @@
 """The brush marks points of the present frame as ground or not; `ground-f1` then compares labels with these marks."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -7,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import viser
 
-from app.mapping.painted import SUFFIX, UNMARKED, Stroke, marks, read_json, to_json
+from app.mapping.painted import SUFFIX, UNMARKED, Stroke, marks, read_json, strokes_of, to_json
 from app.server.keeping import Paint, UndoPaint
 from app.server.protocol import Seek, Snapshot
 from app.slam import lie
@@ -128,10 +129,12 @@ class BrushPanel:
             return
         found = marks(self._page.snapshot().painted).get(result.stamp_ns)
         free = np.ones(len(result.cloud), np.bool_) if found is None else found == UNMARKED
-        for mark, ground in ((GROUND, True), (NON_GROUND, False)):
-            touched = free & ((result.cloud.labels != NON_GROUND) == ground)
-            if touched.any():
-                self._page.send(Paint(Stroke.of(result.stamp_ns, touched, mark)))
+        rest = np.where(free, np.where(result.cloud.labels != NON_GROUND, GROUND, NON_GROUND), UNMARKED)
+        self._send_joined(strokes_of({result.stamp_ns: rest}))
+
+    def _send_joined(self, strokes: tuple[Stroke, ...]) -> None:
+        for number, stroke in enumerate(strokes):
+            self._page.send(Paint(replace(stroke, joined=number > 0)))
 
     # --- the frames that have marks --------------------------------------------------------------
     def _go(self, word: str, _: viser.ClientHandle) -> None:
@@ -147,5 +150,4 @@ class BrushPanel:
         client.send_file_download(name, to_json(snapshot.painted).encode(), save_immediately=True)
 
     def _read(self, file: Any, _: viser.ClientHandle) -> None:
-        for stroke in read_json(file.content.decode("utf-8", errors="replace"), Path(file.name).name):
-            self._page.send(Paint(stroke))
+        self._send_joined(read_json(file.content.decode("utf-8", errors="replace"), Path(file.name).name))

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.mapping.painted import UNMARKED, Stroke, marks, read_json, stroke_of, strokes_of, to_json
+from app.mapping.painted import UNMARKED, Stroke, entry_of, marks, read_json, stroke_of, strokes_of, to_json, undone
 from app.mapping.session_file import Opened, SavedSession, State, read_marks, write_session
 from app.slam.errors import HemislamError
 from app.slam.params import Params
@@ -49,6 +49,16 @@ def test_a_file_brings_the_same_marks_back(painted: list[Stroke]) -> None:
         stamp: labels.tolist() for stamp, labels in marks(painted).items()
     }
     assert strokes_of(again) == strokes_of(marks(painted))
+
+
+@given(st.lists(st.booleans(), max_size=6))
+def test_strokes_of_one_action_are_undone_together_also_after_a_file(joined: list[bool]) -> None:
+    painted = tuple(replace(stroke(n, 0, 3, GROUND), joined=one) for n, one in enumerate(joined))
+    again = tuple(stroke_of(entry_of(one)) for one in painted)
+    assert again == painted
+    left = undone(again)
+    assert left == painted[: len(left)] and (len(left) < len(painted) or not painted)
+    assert all(one.joined for one in painted[len(left) + 1 :]) and not (left and painted[len(left)].joined)
 
 
 @pytest.mark.parametrize(

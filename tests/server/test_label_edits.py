@@ -5,6 +5,7 @@ Tests app/server/controller.py and app/server/publisher.py.
 
 import zlib
 from base64 import b64encode
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,3 +87,6 @@ def test_marks_of_the_brush_are_kept_undone_and_survive_a_restart() -> None:
     assert bench.do(UndoPaint()).painted == (first,)
     assert bench.do(Restart()).painted == (first,)
     assert bench.do(UndoPaint(), UndoPaint()).painted == ()
+    whole = (first, replace(second, joined=True))
+    assert bench.do(Paint(second), *map(Paint, whole), Restart()).painted == (second, *whole)
+    assert bench.do(UndoPaint()).painted == (second,), "one action takes back what one action did"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import viser
 
-from app.mapping.painted import UNMARKED, marks
+from app.mapping.painted import UNMARKED, marks, to_json, undone
 from app.server.keeping import Paint, UndoPaint
 from app.server.protocol import Command, Play, Seek, StepFrame
 from app.slam import lie
@@ -32,7 +32,7 @@ class Painting:
         if isinstance(command, Paint):
             self.engine.publish(painted=(*painted, command.stroke))
         elif isinstance(command, UndoPaint):
-            self.engine.publish(painted=painted[:-1])
+            self.engine.publish(painted=undone(painted))
 
     @property
     def result(self) -> StepResult:
@@ -113,6 +113,8 @@ def test_the_rest_takes_the_engines_labels_and_marks_by_hand_stay(painting: Pain
     assert (painting.marks[by_hand] == NON_GROUND).all()
     engine = painting.result.cloud.labels != NON_GROUND
     assert np.array_equal(painting.marks[~by_hand] == GROUND, engine[~by_hand])
+    user_clicks(painting.panel._undo)
+    assert np.array_equal(painting.marks != UNMARKED, by_hand), "one press takes back what one press did"
 
 
 def test_nothing_is_marked_while_it_plays(painting: Painting) -> None:
@@ -151,6 +153,17 @@ def test_labels_that_are_loaded_are_marked(painting: Painting) -> None:
     user_clicks(painting.panel._undo)
     painting.panel._read(SimpleNamespace(content=files[0], name="walk.labels.json"), client)
     assert np.array_equal(painting.marks, before)
+
+
+def test_one_press_takes_back_all_labels_that_were_loaded(painting: Painting) -> None:
+    painting.panel.choose("ground")
+    user_clicks(painting.panel._rest)
+    content = to_json(painting.engine.snapshot.painted).encode()
+    user_clicks(painting.panel._undo)
+    painting.panel._read(SimpleNamespace(content=content, name="walk.labels.json"), None)  # type: ignore[arg-type]
+    assert len(painting.engine.snapshot.painted) == 2
+    user_clicks(painting.panel._undo)
+    assert painting.engine.snapshot.painted == ()
 
 
 def test_play_is_not_in_the_way_of_the_panel(painting: Painting) -> None:
