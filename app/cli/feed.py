@@ -60,8 +60,10 @@ def feed(
         typer.echo(f"IMU samples go to imu-udp://{target.host}:{beside.ports[0]}")
     if target.scheme == "foxglove":
         typer.echo(f"Waiting at {to} for a receiver; Ctrl+C ends it.")
+    lost: list[str] = []
     with progress_bar("Playing", bar_format="{desc}: {n:.1f} s") as show:
-        count = play(
-            recording, params, target, beside, pace=Pace(speed or math.inf, progress=show), duration_s=duration
-        )
+        pace = Pace(speed or math.inf, progress=show, lost=lost.append)
+        count = play(recording, params, target, beside, pace=pace, duration_s=duration)
     typer.echo(f"{count} {'messages' if target.scheme == 'foxglove' else 'packets'} sent.")
+    if lost:
+        typer.echo(f"Messages that cannot be read were not sent: at least {len(lost)}; the first: {lost[0]}.")

@@ -24,7 +24,7 @@ from app.sensors.live.imu_udp import ImuSample, write_airy_imu, write_imu
 from app.sensors.live.livox_udp import Livox, LivoxWriter
 from app.sensors.live.msop import PacketWriter
 from app.sensors.live.urls import Address
-from app.sensors.recording import ImuEntry, Recording, ScanEntry, open_recording
+from app.sensors.recording import ImuEntry, LostEntry, Recording, ScanEntry, open_recording
 from app.sensors.robosense import AIRY, BPEARL, Model
 from app.sensors.source import Source
 from app.slam import lie
@@ -53,12 +53,14 @@ class Sent:
 class Pace:
     """How fast to play. speed: in multiples of real time; inf: at once. stop: set this to end early.
 
-    progress: called with the seconds of the recording that have been played.
+    progress: called with the seconds of the recording that have been played. lost: called with the reason for each
+    message that is passed over, since it cannot be read.
     """
 
     speed: float = 1.0
     stop: threading.Event = field(default_factory=threading.Event)
     progress: Callable[[float], None] = lambda seconds: None
+    lost: Callable[[str], None] = lambda why: None
 
 
 class _RoboSense:
@@ -95,10 +97,11 @@ def packets_of(
     model: Model | Livox = BPEARL,
     angles: ChannelAngles | None = None,
     pose: F64 | None = None,
+    lost: Callable[[str], None] = lambda why: None,
 ) -> Iterator[Sent]:
     """Everything that the sensors would have sent, in order of time. A wrong stamp is sent when it was logged.
 
-    pose: (4, 4) T_imu_lidar that an Airy states.
+    pose: (4, 4) T_imu_lidar that an Airy states. lost: as in `Pace`.
 
     Raises:
         HemislamError: it is a recording of another LiDAR.
@@ -119,6 +122,7 @@ def packets_of(
         if isinstance(entry, ScanEntry):
             scan = entry.scan
             if not isinstance(scan, Scan):
+                lost(scan.reason)
                 continue
             mapped_ns = lidar.map(scan.end_ns, entry.log_ns)
             begin_ns = mapped_ns - (scan.end_ns - scan.stamp_ns)
@@ -139,6 +143,8 @@ def packets_of(
             time_ns = imu.map(entry.stamp_ns, entry.log_ns)
             if time_ns < stop_ns + 2e8:
                 waiting.append(Sent(time_ns, IMU, sensor.imu(entry.stamp_ns, entry.gyro, entry.accel)))
+        elif isinstance(entry, LostEntry):
+            lost(entry.said)
     waiting += packets(sensor.flush())
     yield from sorted(waiting, key=by_time)
 
@@ -180,7 +186,7 @@ def _feed_packets(
     if imu_to is not None:
         peers[IMU] = (imu_to.host or "127.0.0.1", imu_to.ports[0])
     angles = read_angles(Path(to.options["angles"])) if "angles" in to.options else None
-    sending = packets_of(recording, duration_s, device.model, angles, pose)
+    sending = packets_of(recording, duration_s, device.model, angles, pose, pace.lost)
     number = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for sent in _paced(sending, pace):
@@ -204,9 +210,15 @@ def _feed_foxglove(path: Path, topics: tuple[str, ...], to: Address, pace: Pace,
                 if pace.stop.is_set():
                     return 0
             stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
-            messages = source.messages(topics, None, stop_ns)
-            sending = (Sent(log_ns, topics.index(topic), ros.serialised(said)) for topic, log_ns, said in messages)
-            for sent in _paced(sending, pace):
+
+            def sending() -> Iterator[Sent]:
+                for topic, log_ns, said in source.messages(topics, None, stop_ns, lost=True):
+                    if isinstance(said, ros.Lost):
+                        pace.lost(said.why)
+                    else:
+                        yield Sent(log_ns, topics.index(topic), ros.serialised(said))
+
+            for sent in _paced(sending(), pace):
                 server.publish(sent.stream, sent.time_ns, sent.data)
                 number += 1
             time.sleep(0.2)  # so that the last message is read before the connection is closed
