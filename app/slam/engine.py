@@ -127,7 +127,8 @@ class Engine:
     def step(self, scan: Scan, samples: ImuSamples) -> StepResult:
         """Process one scan with the samples that cover the time from the previous scan's end to this scan's end.
 
-        Without any samples the velocities are assumed to be constant.
+        Without any samples the velocities are assumed to be constant. Samples without finite rates and a finite
+        acceleration other than zero are left out.
         """
         p, before, watch = self.params, self._progress, _Stopwatch()
         end_ns = scan.end_ns
@@ -135,7 +136,9 @@ class Engine:
         clock = before.clock if p.imu.learn_clock else ClockOffset()
         scan = lines.set_right(_in_range(channels.corrected(scan, p.sensor), p.sensor))
         gyro = before.gyro if p.imu.learn_scale else GyroErrors()
-        samples = gyro.set_right(clock.set_right(samples))
+        measured = _measured(samples)
+        bad = (f"{n} IMU samples hold no measurement and were left out",) if (n := len(samples) - len(measured)) else ()
+        samples = gyro.set_right(clock.set_right(measured))
         begun = self._begin(scan, samples, end_ns)
         prediction = predict(begun.belief, begun.samples, end_ns, p.imu, clock.sigma)
         watch.lap("propagate")
@@ -205,7 +208,7 @@ class Engine:
             points_filter=len(sampled.points),
             timings_ms=watch.laps(),
             keyframe=keyframe,
-            notices=_notices(begun, before.status, status, fused, before.bent),
+            notices=bad + _notices(begun, before.status, status, fused, before.bent),
             truth_ground=scan.truth_ground,
             imu_gap_s=imu.longest_gap(samples, end_ns),
             clock_late_s=clock.late,
@@ -360,6 +363,13 @@ def _in_range(scan: Scan, params: SensorParams) -> Scan:
     if clouds.in_range(scan.points, params.min_range, params.max_range, keep) == len(scan):
         return scan
     return scan.part(keep)
+
+
+def _measured(samples: ImuSamples) -> ImuSamples:
+    """Those that an IMU can measure: finite, and with an acceleration, since gravity is always there."""
+    finite = np.isfinite(np.hstack((samples.gyro, samples.accel))).all(axis=1)
+    keep = np.asarray(finite & (samples.accel != 0.0).any(axis=1))
+    return samples if keep.all() else samples.part(keep)
 
 
 def _kept(points: F32, labels: U8, scan: Scan) -> Cloud:

@@ -96,6 +96,21 @@ def test_points_that_are_no_numbers_are_left_out() -> None:
     assert r.status is FrameStatus.TRACKING
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
+@pytest.mark.parametrize("since", [0, 30])
+def test_samples_without_a_measurement_are_left_out_and_said_to_be(value: float, since: int) -> None:
+    """As an IMU sends them while it starts, or loses its sensor for some scans."""
+    walk = list(room_walk(60))
+    for k in range(since, since + 5):
+        bad = np.full_like(walk[k].imu.gyro, value)
+        walk[k] = replace(walk[k], imu=replace(walk[k].imu, gyro=bad, accel=bad))
+    results = run(Engine(params_for(REAL)), walk)
+    assert all("IMU samples hold no measurement" in r.notices[0] for r in results[since : since + 5])
+    assert not any("no measurement" in n for r in [*results[:since], *results[since + 5 :]] for n in r.notices)
+    assert all(r.status is FrameStatus.TRACKING for r in results[since + 10 :])
+    assert worst(results, Walk(), since=since + 10)[0] < 0.1
+
+
 def test_an_empty_first_scan_does_not_end_the_walk() -> None:
     engine = Engine(params_for(REAL))
     results = [engine.step(first_points(m.scan, 0) if k < 15 else m.scan, m.imu) for k, m in enumerate(room_walk())]
