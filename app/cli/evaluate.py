@@ -1,7 +1,7 @@
 """`hemislam evaluate`: the paper's tables, on any recordings."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache
 from importlib.util import find_spec
 from itertools import chain, count
 from pathlib import Path
@@ -15,6 +15,7 @@ from app.slam.provenance import cores
 
 if TYPE_CHECKING:
     from app.evaluation.evaluate import Subject
+    from app.evaluation.job import Job
     from app.evaluation.runner import RunJobs
     from app.slam.arrays import Vector
     from app.slam.trajectory import Trajectory
@@ -126,7 +127,6 @@ def evaluate(
       hemislam evaluate walk.mcap --baseline loam --baseline liom --out results
       hemislam evaluate --suite paper --short --out results
     """
-    from app.cli.run import compile_behind_bar
     from app.evaluation.evaluate import evaluate as run_evaluation
     from app.evaluation.variants import choose_variants, parse_variant
     from app.sensors.simulator.imperfections import IMPERFECT, NONE
@@ -153,7 +153,6 @@ def evaluate(
     for variant in chosen:
         variant.applied(subjects[0].params)  # raises for a misspelt parameter before anything runs
     run = runner(max(1, min(jobs or cores(), len(chosen) * len(subjects))), cluster, cluster_data)
-    compile_behind_bar()
     findings, failures = run_evaluation(
         subjects,
         chosen,
@@ -171,21 +170,28 @@ def evaluate(
 
 
 def runner(parallel: int, address: str | None, url: str, *, quiet: bool = False) -> "RunJobs":
-    """A function that runs jobs, on this machine or on a cluster.
+    """A function that runs jobs, on this machine or on a cluster. It compiles the kernels when it is called first.
 
     Raises:
         HemislamError: Dask is not installed, or an option is there without the one it belongs to.
     """
+    from app.cli.run import compile_behind_bar
     from app.evaluation.cluster import run_on_cluster
     from app.evaluation.runner import run_jobs
 
-    if address is None:
-        if url:
-            raise HemislamError("--cluster-data belongs to --cluster; give both.")
-        return partial(run_jobs, parallel=parallel, quiet=quiet)
-    if find_spec("distributed") is None:
+    if address is None and url:
+        raise HemislamError("--cluster-data belongs to --cluster; give both.")
+    if address is not None and find_spec("distributed") is None:
         raise HemislamError("--cluster needs Dask; install it with `pip install 'hemislam[cluster]'`.")
-    return partial(run_on_cluster, address=address, url=url)
+    compile_once = cache(compile_behind_bar)
+
+    def run(jobs: "list[Job]") -> dict[tuple[str, str], str]:
+        compile_once()
+        if address is None:
+            return run_jobs(jobs, parallel=parallel, quiet=quiet)
+        return run_on_cluster(jobs, address=address, url=url)
+
+    return run
 
 
 def read_subjects(

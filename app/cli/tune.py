@@ -86,7 +86,6 @@ def tune(
     """
     from tqdm import tqdm
 
-    from app.cli.run import compile_behind_bar
     from app.mapping.session_file import read_marks
     from app.tuning.objectives import choose_objectives
     from app.tuning.report import BEST
@@ -108,7 +107,6 @@ def tune(
     rest = part.next(held_back) if held_back != 0 and not marks else None
     run = runner(jobs or parallel_runs(wanted), cluster, cluster_data, quiet=True)
     plan = SearchPlan(subjects, dimensions, wanted, part, rest, search, trials, seed)
-    compile_behind_bar()
     with tqdm(total=trials + 1, desc="Tuning", unit=" trials", disable=None) as bar:
 
         def progress(so_far: Sequence[Trial], _: object) -> None:

@@ -305,6 +305,16 @@ def test_a_run_that_fails_before_its_first_frame_leaves_no_folder(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("command", ["evaluate", "tune"])
+def test_nothing_is_compiled_for_a_recording_that_cannot_be_used(
+    hemislam: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str
+) -> None:
+    monkeypatch.setattr("app.slam.warmup.compile_kernels", lambda *_: pytest.fail("it compiles first"))
+    (tmp_path / "empty.mcap").touch()
+    for name in ("gone.mcap", "empty.mcap"):
+        assert name in hemislam(command, tmp_path / name, "--out", tmp_path / "out", folder=tmp_path).refused()
+
+
 @pytest.mark.parametrize("command", ["run", "replay"])
 def test_interrupted_while_it_compiles_it_leaves_no_folder(
     monkeypatch: pytest.MonkeyPatch, walk: Path, tmp_path: Path, command: str
