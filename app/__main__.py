@@ -7,22 +7,25 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-from typer.core import TyperGroup
+try:
+    import typer
+    from typer.core import TyperGroup
 
-from app import TEMPORARY_KERNEL_CACHE, __version__
-from app.cli import options
-from app.cli.calibrate import calibrate
-from app.cli.compare import compare
-from app.cli.evaluate import evaluate
-from app.cli.export import export
-from app.cli.feed import feed
-from app.cli.georeference import georeference
-from app.cli.replay import replay
-from app.cli.run import run
-from app.cli.serve import serve
-from app.cli.tune import tune
-from app.slam.errors import HemislamError, refusal
+    from app import TEMPORARY_KERNEL_CACHE, __version__
+    from app.cli import options
+    from app.cli.calibrate import calibrate
+    from app.cli.compare import compare
+    from app.cli.evaluate import evaluate
+    from app.cli.export import export
+    from app.cli.feed import feed
+    from app.cli.georeference import georeference
+    from app.cli.replay import replay
+    from app.cli.run import run
+    from app.cli.serve import serve
+    from app.cli.tune import tune
+    from app.slam.errors import HemislamError, refusal
+except KeyboardInterrupt:  # loading these takes most of the time until `_Commands` handles Ctrl-C
+    sys.exit(130)
 
 LEAST_MEMORY = 900 << 20
 """Bytes of addresses that numba, its threads and a walk take."""
@@ -309,7 +312,10 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file name may be no UTF-8
-    cli(prog_name="hemislam")
+    try:
+        cli(prog_name="hemislam")
+    except KeyboardInterrupt:  # before `_Commands` handles it
+        sys.exit(130)
 
 
 if __name__ == "__main__":

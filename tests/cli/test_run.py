@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from app.__main__ import cli
+from app.__main__ import cli, main
 from app.export.exports import BY_RUN
 from app.mapping.session import Session
 from app.mapping.session_file import Opened, SavedSession, State, new_path, size_of, write_session
@@ -262,6 +262,20 @@ def test_an_interrupted_run_keeps_what_it_has(monkeypatch: pytest.MonkeyPatch, w
     assert "20 processed" in outcome.output
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == RESULTS
     assert json.loads((tmp_path / "out" / "report.json").read_text())["stopped_early"] == "KeyboardInterrupt"
+
+
+def test_ctrl_c_while_the_program_loads_gives_no_traceback(
+    hemislam_alone: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def press(**_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("app.__main__.cli", press)
+    with pytest.raises(SystemExit, match="130"):
+        main()
+    (tmp_path / "typer.py").write_text("raise KeyboardInterrupt\n")  # found before the installed one
+    done = hemislam_alone("--version", folder=tmp_path)
+    assert (done.code, done.out, done.err) == (130, "", "")
 
 
 def test_ctrl_c_while_results_are_saved_does_not_lose_them(
