@@ -21,7 +21,9 @@ _PIN_COLOUR: Final = (255, 190, 60)
 _PIN_M: Final = 0.16
 _REACH_PX: Final = 14.0
 _LETTER_PX: Final = 6.0
-"""A click within this distance of a pin, or on the text to its right, selects the pin."""
+"""A click within this distance of a pin, or on the text to its right, selects the pin. In pixels of CSS, as labels."""
+_HIGH_PX: Final = 950.0
+"""CSS pixels of a usual page's height. viser tells only the device's pixels, of which a HiDPI screen has more."""
 
 
 class NotesPanel:
@@ -88,8 +90,7 @@ class NotesPanel:
         """The frame of the clicked pin."""
         if not self._pinned:
             return None
-        camera = event.client.camera
-        pixels = np.array([camera.image_width, camera.image_height])
+        pixels = np.array([event.client.camera.aspect, 1.0]) * _HIGH_PX
         x, y = ((event.screen_pos - self._page.in_picture(event.client, self._where)) * pixels).T
         width = _REACH_PX + _LETTER_PX * np.array([len(text) for _, text in self._pinned])
         hit = np.flatnonzero((np.abs(y) <= _REACH_PX) & (x >= -_REACH_PX) & (x <= width))

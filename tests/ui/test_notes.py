@@ -144,11 +144,14 @@ WALK = np.column_stack((np.arange(100.0), np.zeros(100), np.zeros(100)))
 """m, a frame at every metre along x."""
 
 
-def click(x: float, y: float = 0.0) -> Any:
-    """A click on the map at (x, y, 0), seen from 10 m above it; the picture's top is +y, and 900 pixels show 20 m."""
+def click(x: float, y: float = 0.0, ratio: int = 1) -> Any:
+    """A click on the map at (x, y, 0), seen from 10 m above it; the picture's top is +y, and 900 pixels show 20 m.
+
+    ratio: of the device's pixels to those of CSS.
+    """
     camera = SimpleNamespace(
         position=np.array([50.0, 0.0, 10.0]), wxyz=np.array([0.0, 1.0, 0.0, 0.0]), fov=np.pi / 2, aspect=2.0,
-        image_width=1800, image_height=900,
+        image_width=1800 * ratio, image_height=900 * ratio,
     )  # fmt: skip
     seen = np.array([(x - 50.0) / 40 + 0.5, 0.5 - y / 20])
     return SimpleNamespace(client=SimpleNamespace(camera=camera), screen_pos=seen)
@@ -184,10 +187,13 @@ def test_notes_stand_where_the_sensor_was_and_move_with_the_trajectory(server: v
         ((45.1, 0.0), 45),
     ],
 )
-def test_a_click_on_a_pin_goes_to_its_frame(notes: Notes, at: tuple[float, float], frame: int | None) -> None:
+@pytest.mark.parametrize("ratio", [1, 2, 3])
+def test_a_click_on_a_pin_goes_to_its_frame_on_any_screen(
+    notes: Notes, at: tuple[float, float], frame: int | None, ratio: int
+) -> None:
     notes.snapshot = replace(notes.snapshot, trajectory=WALK)
     notes.show(Note(40, "a door"), Note(45, "a lift"))
-    assert notes.panel.clicked(click(*at)) is (frame is not None)
+    assert notes.panel.clicked(click(*at, ratio)) is (frame is not None)
     assert notes.sent == ([Seek(frame)] if frame is not None else [])
 
 
