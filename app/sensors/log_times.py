@@ -28,6 +28,15 @@ def sound_span(times: I64) -> tuple[int, int, int]:
     return int(times[first]), int(times[stop - 1]) + 1, len(times) - int(stop - first)
 
 
+def overlap(times: I64) -> tuple[int, int] | None:
+    """The span that (n,) log times in file order cover twice, since the clock was set back; None if it was not."""
+    for at in (np.flatnonzero(np.diff(times) < -SET_BACK_NS) + 1).tolist():
+        before, after = np.median(times[max(at - 5, 0) : at]), np.median(times[at : at + 5])  # a few may be wrong
+        if min(at, len(times) - at) > FEW and times[0] < after < before - SET_BACK_NS:
+            return int(times[at]), int(times[at - 1])
+    return None
+
+
 def mended(times: I64) -> dict[int, int]:
     """Better values, by index, for those of (n,) log times in file order that are far from their neighbours."""
     if len(times) <= 2 * _REACH:

@@ -15,8 +15,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1.reader import Header, ReaderError, RecordType, read_bytes, read_uint32
 from rosbags.typesys import Stores, get_typestore
 
-from app.sensors.log_times import FAR_NS, FEW, LATEST_NS, SET_BACK_NS, sound_span
-from app.sensors.ros import Deserialiser, read_or_lose
+from app.sensors.cloud_types import CLOUD_TYPES
+from app.sensors.log_times import FAR_NS, FEW, LATEST_NS, SET_BACK_NS, overlap, sound_span
+from app.sensors.ros import IMU, Deserialiser, read_or_lose
 from app.sensors.unpacking import adapt_rosbags
 from app.slam.errors import printable
 from app.slam.types import I64
@@ -30,6 +31,8 @@ class RosbagsStream:
 
     Attributes:
         wild: how many messages have log times far from all others; they are left out.
+        mixed: the log times between which two parts are mixed, since the recorder's clock was set back; None if it was
+            not, or if it is not known.
     """
 
     by_log_time = True
@@ -47,7 +50,10 @@ class RosbagsStream:
             topic = printable(connection.topic)
             _, before = self.counts.get(topic, ("", 0))
             self.counts[topic] = (printable(connection.msgtype), before + connection.msgcount)
-        self.start_ns, self.end_ns, self.wild = self._span()
+        times = self._log_times()
+        self.start_ns, self.end_ns, self.wild = self._span(times)
+        spans = [span for kind, of in times if kind in {IMU, *CLOUD_TYPES} and (span := overlap(of))]
+        self.mixed = (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
         if self.wild:
@@ -114,23 +120,28 @@ class RosbagsStream:
         self._reader.close()
         self._links.cleanup()
 
-    def _span(self) -> tuple[int, int, int]:
+    def _span(self, times: list[tuple[str, I64]]) -> tuple[int, int, int]:
         """Log time of the first message, the end after the last, and how many are too far away to count."""
-        if len(times := self._log_times()):
-            return sound_span(times)
+        if any(len(of) for _, of in times):
+            return sound_span(np.concatenate([of for _, of in times]))
         spans = [file.metadata for file in self._files()] or self._reader.readers  # a metadata.yaml may be wrong
         start_ns, end_ns = min(one.start_time for one in spans), max(one.end_time for one in spans)
         return min(start_ns, LATEST_NS), min(end_ns, LATEST_NS), 0
 
-    def _log_times(self) -> I64:
-        """The log times of all messages of bags and databases."""
-        bags = chain.from_iterable(bag.indexes.values() for bag in self._bags())
-        times = [np.array([entry.time for entry in index], np.int64) for index in bags]
+    def _log_times(self) -> list[tuple[str, I64]]:
+        """The log times of all messages of bags and databases: type and times of each topic of a file, in its order."""
+        topics = [(one.msgtype, bag.indexes[one.id]) for bag in self._bags() for one in bag.connections]
+        in_order = itemgetter(1, 2)
+        times = [(kind, np.array([at.time for at in sorted(index, key=in_order)], np.int64)) for kind, index in topics]
         for file in self._files():
             if (database := getattr(file, "dbconn", None)) is not None:
-                rows = database.execute("SELECT CAST(ifnull(timestamp, 0) AS INTEGER) FROM messages")
-                times.append(np.fromiter(chain.from_iterable(rows), np.int64))
-        return np.concatenate([np.empty(0, np.int64), *times])
+                rows = database.execute(
+                    "SELECT topic_id, CAST(ifnull(timestamp, 0) AS INTEGER) FROM messages ORDER BY rowid"
+                )
+                numbers, log_ns = np.fromiter(chain.from_iterable(rows), np.int64).reshape(-1, 2).T
+                kinds = {one.id: one.msgtype for one in file.connections}
+                times += [(kinds.get(number, ""), log_ns[numbers == number]) for number in np.unique(numbers).tolist()]
+        return times
 
     def _bags(self) -> list[Any]:
         """The ROS 1 bags, as rosbags has them open."""

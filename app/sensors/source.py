@@ -181,6 +181,14 @@ def _open(path: Path) -> tuple[Stream, tuple[Finding, ...]]:
         wrong = "it has no index of its messages" if unindexed else "log times in it are wrong"
         why = "the recorder's clock was set back while recording" if in_order.set_back else wrong
         return in_order, (*found, Finding("file", "corrected", f"read in the order of the file, since {why}"))
+    if reader.mixed is not None:
+        from_s, until_s = ((log_ns - reader.start_ns) / 1e9 for log_ns in reader.mixed)
+        text = (
+            f"the recorder's clock was set back, and what it recorded from {from_s:.1f} to {until_s:.1f} s is mixed "
+            "with what it recorded after that; map the parts on either side"
+        )
+        advice = f"--duration {from_s:.1f}, and --start {until_s:.1f}"
+        found = (*found, Finding("log times", "needs you", text, advice))
     if unmerged := [wal for file in files for wal in _write_ahead_logs(file)]:
         database = str(unmerged[0]).removesuffix("-wal")
         text = (

@@ -1,5 +1,6 @@
 """A clock set in the middle of a recording: times continue without a jump, and a finding reports the leap."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -123,6 +124,19 @@ def test_a_pause_is_no_leap(tmp_path: Path) -> None:
         every = list(recording.measurements())
     assert recording.duration_s == pytest.approx(TURNS / 10, abs=0.1)
     assert not [entry for entry in every if isinstance(entry, DroppedScan)]
+
+
+@pytest.mark.parametrize("container", ["bag", "bare-db3"])
+@pytest.mark.parametrize("seconds", [-2, -7])
+def test_a_recorder_whose_clock_alone_is_set_back_is_named_where_messages_come_by_log_time(
+    tmp_path: Path, container: str, seconds: int
+) -> None:
+    path = recorded(tmp_path / "walk", right, right, set_by(seconds), container)
+    with open_recording(path, Params()) as recording:
+        (found,) = [finding for finding in recording.findings if finding.subject == "log times"]
+    assert found.verdict == "needs you" and "clock was set back" in found.text
+    said = re.fullmatch(r"--duration ([\d.]+), and --start ([\d.]+)", found.option)
+    assert said is not None and [float(one) for one in said.groups()] == pytest.approx([12 + seconds, 12], abs=0.15)
 
 
 @pytest.mark.parametrize("container", ["bag", "bare-db3"])
