@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
@@ -141,8 +141,6 @@ class Child(Link):
         name: for `ps` ("hemislam-NAME", 15 characters) and the log. title: for messages.
         fork: fork a process that has imported what the first such child needs, which takes 20 ms, where possible; else
             a new interpreter starts.
-        environment: variables of the child. If the owner lacks them, a new interpreter starts also with `fork`, since
-            libraries read such variables when they are imported.
         grace_s: how long it may go on working when its owner dies or asks it to end.
     """
 
@@ -153,15 +151,12 @@ class Child(Link):
         name: str,
         title: str,
         fork: bool = False,
-        environment: Mapping[str, str] | None = None,
         grace_s: float = GRACE_S,
     ) -> None:
-        variables = dict(environment or {})
-        fork = fork and variables.items() <= os.environ.items()
         context = fork_context(main.__module__) if fork else multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        call = pickle.dumps((main, args))  # to be loaded once the variables are set, since that imports numpy
-        self._process = context.Process(target=_run, args=(theirs, name, grace_s, variables, call))
+        call = pickle.dumps((main, args))  # to be loaded there, since that may import much
+        self._process = context.Process(target=_run, args=(theirs, name, grace_s, call))
         with _signals_blocked(), _main_hidden():
             self._process.start()
         theirs.close()
@@ -214,13 +209,10 @@ def _end_children() -> None:
         child.close()
 
 
-def _run(
-    connection: "Connection[Any, Any]", name: str, grace_s: float, environment: dict[str, str], call: bytes
-) -> None:
+def _run(connection: "Connection[Any, Any]", name: str, grace_s: float, call: bytes) -> None:
     """The process."""
     gc.freeze()  # else its garbage collector writes to the pages of what the fork server imported, which forks share
     gc.enable()
-    os.environ.update(environment)
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     multiprocessing.set_start_method("spawn", force=True)  # so that numba makes no semaphore, which a kill would leak

@@ -9,10 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-# Before numpy is loaded: threads that share a core with another process of the tests wait for each other. That results
-# do not depend on their number is tested in slam/test_engine_repeats.py and recordings/test_odometry.py.
-os.environ.update({f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")})
-
 # Containers often set it. Each process that the tests start would then compile the program anew, and each worker the
 # tests.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -148,10 +148,6 @@ def hang(owner: Link, grandchild: bool = False) -> None:
         time.sleep(1.0)
 
 
-def reads_environment(owner: Link) -> None:
-    owner.send((os.environ.get("HEMISLAM_TEST", "not set"), os.getppid()))
-
-
 def echoing() -> Child:
     return Child(echo, "hello", name="echo", title="The echo")
 
@@ -268,21 +264,6 @@ def test_children_of_children_end_with_them() -> None:
     for pid in pids:
         until_gone(pid)
     assert not any(alive(pid) for pid in pids)
-
-
-@pytest.mark.parametrize("ours", ["set", None])
-def test_variables_reach_a_child_which_is_a_fork_only_if_its_owner_has_them(
-    ours: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Libraries read them when they are loaded, and those of a fork have been."""
-    monkeypatch.delenv("HEMISLAM_TEST", raising=False)
-    if ours is not None:
-        monkeypatch.setenv("HEMISLAM_TEST", ours)
-    child = Child(reads_environment, name="env", title="The child", fork=True, environment={"HEMISLAM_TEST": "set"})
-    variable, parent = child.receive(TIMEOUT_S)
-    child.close()
-    assert variable == "set" and os.environ.get("HEMISLAM_TEST") == ours
-    assert (parent != os.getpid()) == (ours == "set" and sys.platform == "linux")
 
 
 LEFT_OPEN = """

@@ -13,8 +13,6 @@ from app.slam.loops.types import LoopChange, LoopEdge, changed_by, difference
 
 NICENESS: Final = 10
 """The frame loop comes first."""
-_ONE_THREAD: Final = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
-"""More threads would compete with the frame loop for the cores."""
 MOST_DEATHS: Final = 3
 """A worker is replaced this many times; after that, loops stay as they are."""
 GIVEN_UP: Final = "Loops are no longer looked for; restart to try again."
@@ -27,7 +25,7 @@ class LoopProcess(Child):
 
     def __init__(self) -> None:
         title = "The process that looks for loops"
-        super().__init__(main, name="loops", title=title, fork=True, environment=_ONE_THREAD, grace_s=0.0)
+        super().__init__(main, name="loops", title=title, fork=True, grace_s=0.0)
         self._edges: tuple[LoopEdge, ...] = ()
 
     def receive(self, timeout: float | None = None) -> Reply | None:

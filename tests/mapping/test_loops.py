@@ -1,5 +1,6 @@
 """Loops are searched in a process. If it dies, it is replaced by another one, which gets the missing data."""
 
+import multiprocessing
 import os
 import signal
 import time
@@ -69,9 +70,9 @@ def until_gone(pid: int) -> None:
 
 @pytest.fixture(params=["a fork", "a new interpreter"])
 def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[LoopProcess]:
-    """As in these tests, and as in a program whose libraries use several threads."""
+    """As on Linux, and as on systems that cannot fork."""
     if request.param == "a new interpreter":
-        monkeypatch.delenv("OMP_NUM_THREADS")
+        monkeypatch.setattr("app.child.fork_context", lambda module: multiprocessing.get_context("spawn"))
     process = LoopProcess()
     yield process
     process.close()
