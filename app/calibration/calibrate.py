@@ -141,7 +141,7 @@ class Calibration:
             parts.append(f"the LiDAR seems to be rotated by {angles} on the IMU")
         if observed["translation"] and np.linalg.norm(p - sensor.translation) > APART_PLACE:
             place = ", ".join(f"{x:.2f}" for x in self.moved.p_imu_lidar)
-            parts.append(f"it seems to be at {place} m on the IMU")
+            parts.append(f"{'it' if parts else 'the LiDAR'} seems to be at {place} m on the IMU")
         if observed["offset"] and abs(self.turned.late) > 5 * LARGEST_OFFSET:
             late = -self.turned.late * 1e3
             parts.append(f"the IMU's clock seems to be {abs(late):.0f} ms {'late' if late > 0 else 'early'}")

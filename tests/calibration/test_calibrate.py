@@ -68,6 +68,13 @@ def test_a_mounting_of_a_preset_counts_for_the_imu_inside_only(tmp_path: Path) -
     assert turned.contradiction().startswith("The LiDAR seems to be rotated by 70°, -50°, 104°")
 
 
+def test_a_place_alone_is_said_to_be_the_lidars(tmp_path: Path) -> None:
+    found = known(tmp_path / "walk.mcap")
+    given = {"sensor.rotation": found.rotation, "sensor.translation": (0.0, 0.0, 0.5)}
+    found = replace(found, params=found.params.with_values(given))
+    assert found.contradiction().startswith("The LiDAR seems to be at -0.01, -0.02, 0.04 m on the IMU")
+
+
 def test_a_mirrored_gyroscope_is_named_instead_of_a_mounting(excerpt: Excerpt) -> None:
     imu = replace(excerpt.imu, gyro=excerpt.imu.gyro * [1.0, -1.0, 1.0])
     with pytest.raises(MirroredError, match=r"in a mirror: .*gyroscope_axes to -xyz, x-yz or xy-z"):
