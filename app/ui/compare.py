@@ -134,6 +134,7 @@ class ComparePanel:
         self._ground: U8 = _NO_POINTS
         self._scene_changes, self._pair_changes = Changes(page.now, SCENE_PERIOD_S), Changes()
         self._panel_changes = Changes(page.now, PANEL_PERIOD_S)
+        self._name_changes = Changes()
 
         self._status = gui.add_html(panel("no_fork", False))
         self._name = gui.add_text("name", "", hint="Name of the fork, and of its file if you keep it.")
@@ -149,7 +150,7 @@ class ComparePanel:
         with self._comparison:
             self._add_comparison(gui)
         self._what.on_click(by_user(self._act))
-        add_command(gui, "Swap A and its fork B", lambda _: self._swap(), hotkey="X")
+        add_command(gui, "Swap A and its fork B", lambda _: forks.swap(), hotkey="X")
 
     def _add_comparison(self, gui: viser.GuiApi) -> None:
         gui.add_html(maths.legend())
@@ -174,8 +175,10 @@ class ComparePanel:
 
     def draw(self, a: Snapshot, view: View) -> None:
         """Called often by the drawing thread, with the view after all other panels have changed it."""
-        b = self._forks.other
+        b, name = self._forks.other, self._forks.names[1]
         self._sides.draw(b)
+        if self._name_changes(name):
+            show(self._name, name)  # `keep` keeps B
         self._fork.visible = self._open.visible = b is None
         self._fork.disabled = self._open.disabled = a.live is not None
         self._what.visible = self._by_ground.visible = self._comparison.visible = b is not None
@@ -235,16 +238,12 @@ class ComparePanel:
     def _act(self, what: Any, client: viser.ClientHandle) -> None:
         match what:
             case "swap":
-                self._swap()
+                self._forks.swap()
             case "keep":
                 path = self._forks.keep(self._name.value)
                 client.add_notification("Kept", f"The fork is saved as {path}; hemislam serve opens it.")
             case "discard":
                 self._forks.discard()
-
-    def _swap(self) -> None:
-        self._forks.swap()
-        show(self._name, self._forks.names[1])  # `keep` keeps B
 
     def _begin(self) -> None:
         self._forks.fork(self._name.value)

@@ -307,6 +307,22 @@ def test_keep_says_where_the_file_is_and_errors_are_shown(page: Page, tmp_path: 
     assert page.engine.sent[-1] == SetParams({"ground.alpha": 31.0}), "without a fork all is A's"
 
 
+def test_a_fork_made_elsewhere_is_kept_under_its_own_name_not_that_of_the_last(page: Page, tmp_path: Path) -> None:
+    page.forks.fork("wide")
+    page.both_at(20)
+    assert chooses(page.panel._what, "swap").told == [] and page.forks.names == ("wide", "main")
+    page.draw()
+    assert page.panel._name.value == "main"
+    chooses(page.panel._what, "keep")
+    page.draw()
+    assert page.panel._name.value == "", "the name is no longer that of B"
+    page.forks.fork("trial 6")
+    page.both_at(20)
+    assert page.panel._name.value == "trial 6"
+    chooses(page.panel._what, "keep")
+    assert (tmp_path / "hall_bpearl-trial-6.hemislam").exists()
+
+
 def test_the_page_says_how_b_is_doing(page: Page) -> None:
     a = page.engine.snapshot
     recording = a.recording
