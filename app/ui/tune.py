@@ -25,8 +25,6 @@ _LEAST_S: Final = 5.0
 _LABELLED: Final = "the labelled frames"
 _NONE: Final = "–"
 _TITLES: Final = {one.title: one.name for one in OBJECTIVES.values()}
-_FORK: Final = "trial "
-"""Names of forks opened here."""
 _EMPTY: Final = (
     "Choose the parameters to vary and the objective, go to a part of the recording that shows the problem, and press "
     "Start. Each trial processes that part with other parameters, without changing this session."
@@ -45,6 +43,7 @@ class TunePanel:
         self._page, self._forks, self._sides, self._folder = page, forks, sides, folder
         self._wanted: Wanted | None = None  # by the newest search
         self._found, self._chosen = Tried(), -1
+        self._opened = ""  # name of the trial that is B, as long as B has been nothing else
         self._runs: list[tuple[float, int]] = []  # (time, finished runs), since the last run that took no time
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._why = gui.add_html("")
@@ -78,6 +77,8 @@ class TunePanel:
         if self._wanted is not None and recording is not None and recording != self._wanted.recording:
             self.close()
             self._wanted, self._found, self._chosen = None, Tried(), -1
+        if self._forks.names[1] != self._opened:
+            self._opened = ""  # once it was A, it is the user's
         problem = self._problem(snapshot)
         self._receive()
         running = self._work.running
@@ -198,8 +199,9 @@ class TunePanel:
         if not 0 <= number < len(self._found.trials):
             return
         self._chosen = number
-        if self._forks.names[1].startswith(_FORK):
+        if self._opened and self._forks.names[1] == self._opened:
             self._forks.discard()
         if number:
-            self._forks.fork(f"{_FORK}{number}", self._found.trials[number].values)
+            self._forks.fork(word, self._found.trials[number].values)
+            self._opened = word
             self._sides.choose("B")

@@ -127,9 +127,21 @@ def test_a_click_on_a_trial_opens_it_as_b_with_its_values_on_the_sliders(tuning:
 def test_a_click_never_discards_a_fork_that_was_made_by_hand(tuning: Tuning) -> None:
     user_clicks(tuning.panel._start)
     tuning.draw(Tried(TRIALS, (3,)))
-    tuning.forks.fork("mine")
+    tuning.forks.fork("trial of mine")
     user_sets(tuning.panel._bridge._field, "trial 3 #1")
-    assert tuning.forks.names[1] == "mine" and "already" in told[0]
+    assert tuning.forks.names[1] == "trial of mine" and "already" in told[0]
+
+
+def test_a_click_never_discards_a_trial_that_was_worked_on_as_a(tuning: Tuning) -> None:
+    user_clicks(tuning.panel._start)
+    tuning.draw(Tried(TRIALS, (3,)))
+    user_sets(tuning.panel._bridge._field, "trial 1 #1")
+    for names in (("trial 1", "main"), ("main", "trial 1")):
+        tuning.forks.swap()
+        tuning.draw()
+        assert tuning.forks.names == names
+    user_sets(tuning.panel._bridge._field, "trial 3 #2")
+    assert tuning.forks.names[1] == "trial 1" and "already" in told[0]
 
 
 def test_what_cannot_be_measured_is_refused_in_a_sentence(tuning: Tuning) -> None:
