@@ -45,7 +45,7 @@ _NOT_KEPT = "This session has no session file, so it cannot be forked."
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """A or B. folder: of a fork; deleted when the fork is discarded."""
+    """A or B. folder: of a fork that was never A; deleted when the fork is kept elsewhere or discarded."""
 
     engine: RunningEngine
     name: str
@@ -194,11 +194,11 @@ class Workspace:
                 b.engine.send(Seek(before.transport.frame))
             if before.transport.playing:
                 b.engine.send(Play())
-            self._sides = (b, a)
+            self._sides = (replace(b, folder=None), a)  # its files are the user's now, of other recordings as well
             b.engine.send(AddNote(f"Swapped: replaces {a.name}."))
 
     def discard(self) -> None:
-        """End B and delete its files. Raises HemislamError without a fork."""
+        """End B and delete its files, unless it was A before. Raises HemislamError without a fork."""
         with self._lock:
             b = self._end()
             if b.folder is not None:

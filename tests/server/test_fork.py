@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -237,6 +238,20 @@ def test_a_discarded_fork_leaves_nothing_and_there_can_be_another(pair: Workspac
     assert not list((tmp_path / "forks").iterdir())
     pair.fork("again", {"ground.sigma": 0.15})
     assert both_at(pair, 20)[1].params.ground.sigma == 0.15
+
+
+@pytest.mark.parametrize("end", [Workspace.discard, Workspace.keep])
+def test_what_was_opened_while_a_fork_was_a_outlives_the_fork(pair: Workspace, end: Callable[[Workspace], Any]) -> None:
+    pair.fork("wide")
+    both_at(pair, 20)
+    pair.swap()
+    first = pair.snapshot
+    assert first.recording is not None and first.session_file is not None
+    pair.send(OpenRecording(first.recording.path))
+    until(lambda: pair.snapshot, lambda s: s.session != first.session and s.result is not None)
+    pair.swap()
+    end(pair)
+    assert first.session_file.exists()
 
 
 def test_a_kept_fork_is_a_file_of_its_name_that_replaces_none(pair: Workspace, tmp_path: Path) -> None:
