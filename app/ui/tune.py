@@ -112,9 +112,8 @@ class TunePanel:
         if not found.finished:
             failed = bool(found.trials) and all(trial.error for trial in found.trials)
             return f"{done} · stopped" + (f" · all failed: {found.trials[0].error}" if failed else "")
-        return " ".join(
-            (f"{done} · saved in {wanted.folder}", advice(found.trials, found.held_back, self._objectives()))
-        )
+        best = advice(found.trials, found.held_back, self._objectives())
+        return " · ".join(filter(None, (done, f"saved in {wanted.folder}", best)))
 
     def _left(self, wanted: Wanted) -> str:
         """The time left, estimated from the pace of the newest runs."""

@@ -107,7 +107,10 @@ def test_a_search_that_is_stopped_goes_on_with_the_same_settings(tuning: Tuning)
     tuning.draw(Ended(10, True))
     assert tuning.says("6 min left"), "39 runs of 10 s"
     tuning.draw(Tried(TRIALS, (3,), held_back=(replace(TRIALS[0], scores=(2.1,)),), finished=True))
-    assert tuning.process is None and not tuning.panel._go_on.visible and tuning.says("saved in")
+    assert tuning.process is None and not tuning.panel._go_on.visible
+    assert tuning.says(
+        f"4 of 49 trials · saved in {first.arguments[0].folder} · On the part held back nothing is better"
+    )
     assert "held back" in tuning.panel._plots.content
 
 
