@@ -8,6 +8,7 @@ Browsers and the engine may both change a value. A value set by a user is sent a
 snapshots, except those touched a moment ago: an older snapshot must not move a slider while the user drags it.
 """
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,7 +213,7 @@ class ParameterPanel:
         self._now = page.now
         self._params = params
         self._edits: dict[str, Edit] = {}
-        self._engine = 0
+        self._of: tuple[object, ...] = (0, None)  # engine and recording whose parameters are shown
         self._widgets: dict[str, list[Widget]] = {}
         self._resets: dict[str, viser.GuiButtonGroupHandle] = {}
         self._sections: dict[str, dict[str, Leaf]] = {}
@@ -220,7 +221,8 @@ class ParameterPanel:
             group = "primary" if leaf.path in PRIMARY else leaf.section
             self._sections.setdefault(group, {})[leaf.name] = leaf
         self._names = {leaf.path: spoken(leaf) for leaf in leaves()}
-        self._history = ParameterHistory()
+        self._histories: defaultdict[tuple[object, ...], ParameterHistory] = defaultdict(ParameterHistory)
+        self._history = self._histories[self._of]
         self._released = False  # whether a slider was released whose last value may still be on its way
         self._bridge = Bridge(gui, "sliders", lambda *_: setattr(self, "_released", True))
         gui.add_html(self._bridge.live(panel("released")))
@@ -256,8 +258,9 @@ class ParameterPanel:
     def draw(self, snapshot: Snapshot, tuning: bool = False) -> None:
         """Update the controls from a snapshot. tuning: whether the user is moving ground sliders."""
         now = self._now()
-        if engine_number(snapshot) != self._engine:  # these edits were for the other engine
-            self._engine = engine_number(snapshot)
+        of = engine_number(snapshot), snapshot.recording.path if snapshot.recording else None
+        if of != self._of:  # these edits were for another engine or recording
+            self._of, self._history = of, self._histories[of]
             self._edits.clear()
         for path, edit in list(self._edits.items()):
             if not edit.sent and now - edit.at >= _TYPING_S:

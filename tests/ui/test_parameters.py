@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 import viser
 
+from app.server.fork import APART
 from app.server.protocol import (
     Command,
+    OpenedRecording,
     Progress,
     Restart,
     SetParams,
@@ -239,6 +241,22 @@ def test_undo_and_redo_are_below_the_sliders_and_never_come_or_go(parameters: Pa
     parameters.tick(5.0)
     assert panel._undo.visible and not panel._undo.disabled and panel._undo.label == "Undo σ thickness"
     assert panel._redo.visible and panel._redo.disabled
+
+
+def test_undo_never_brings_the_values_of_another_recording_or_side(parameters: Parameters) -> None:
+    turned = Params().with_values({"sensor.rotation": (0.0, 90.0, 0.0)})
+    first, second = (OpenedRecording(Path(name), 0, 60.0, 600, ()) for name in ("hall.mcap", "walk.mcap"))
+    parameters.tick(recording=first)
+    parameters.params = turned.with_values({"ground.sigma": 0.1})
+    parameters.tick(10.0, recording=first)
+    label = parameters.panel._undo.label
+    for changes in ({"recording": second}, {"recording": first, "session": APART}):
+        parameters.params = turned
+        parameters.tick(10.0, **changes)
+        assert parameters.panel._undo.disabled and parameters.panel._redo.disabled
+    parameters.params = turned.with_values({"ground.sigma": 0.1})
+    parameters.tick(10.0, recording=first)
+    assert parameters.panel._undo.label == label, "its own changes can be undone again"
 
 
 def test_changes_that_wait_for_a_restart_are_named_beside_a_restart_button(parameters: Parameters) -> None:
