@@ -12,7 +12,8 @@ viser has no events for HTML and no way to run a script, and it has keys of its 
 * A number box is an `<input class="mantine-NumberInput-input">` whose `input` events viser sends; that of a slider
   is beside its track.
 * Tooltips have the class `mantine-Tooltip-tooltip`, and the scene is a `<canvas data-engine>`.
-* A phone's panel has its largest height and its width in its style; a folder is a Paper with a border.
+* A phone's panel has its largest height and its width in its style; a folder is a Paper with a border. Its head is
+  another Paper, with the cursor of a pointer, and its icon is chevron-down while it is closed.
 * While the server is not connected, panels are dimmed with a transition of 150 ms and take no clicks.
 * The scene is inset by the width of the docked panel, whose chevron carries `data-dock-region-collapse`.
 * Dock tabs carry `data-dock-tab`; the tab that is shown has `aria-selected`. The two buttons beside the title have the

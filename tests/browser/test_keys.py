@@ -53,6 +53,20 @@ def test_a_key_that_is_held_counts_once_but_an_arrow_goes_on(bench: Bench) -> No
     bench.eventually(lambda: bench.engine.sent.count(StepFrame()) > 1)
 
 
+def test_a_folder_is_reached_by_tab_and_opened_by_enter(bench: Bench) -> None:
+    page = bench.page
+    page.get_by_role("tab", name="Parameters").click()
+    head = page.get_by_role("button", name="Reading the recording")
+    expect(head).to_have_attribute("aria-expanded", "false")
+    page.get_by_role("button", name="nothing changed").first.focus()
+    page.keyboard.press("Tab")
+    expect(head).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(head).to_have_attribute("aria-expanded", "true")
+    page.keyboard.press("Enter")
+    expect(head).to_have_attribute("aria-expanded", "false")
+
+
 def test_behind_a_dialog_keys_do_nothing(bench: Bench) -> None:
     bench.page.get_by_role("tab", name="Parameters").click()
     bench.page.get_by_role("button", name="Load YAML").click()

@@ -67,6 +67,10 @@ ASSUMPTIONS = {
         "components/Folder.tsx",
         "<Paper\n      withBorder",
     ),
+    "The head of a folder is no longer a Paper to click: the keyboard does not open it.": (
+        "components/Folder.tsx",
+        'cursor: isEmpty ? undefined : "pointer",\n        }}\n        onClick={toggle}',
+    ),
     "Tooltips are no longer Mantine's: they cover the controls around.": (
         "components/common.tsx",
         "<Tooltip\n          zIndex={100}",

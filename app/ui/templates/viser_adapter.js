@@ -97,6 +97,11 @@ if (!window.hemislamSay) {
         button.title = name; button.setAttribute('aria-label', name);
       }
     }
+    // viser's folders open by the mouse only; here Tab reaches their heads, and Enter opens and closes them.
+    for (const head of document.querySelectorAll('.mantine-Paper-root[data-with-border]>.mantine-Paper-root')) {
+      if (head.style.cursor !== 'pointer') continue;
+      head.tabIndex = 0; head.role = 'button'; head.ariaExpanded = !head.querySelector('.tabler-icon-chevron-down');
+    }
   }, 1000);
 
   // Show a tab, docked or on a phone, and unfold what is folded in a part of it.
@@ -121,6 +126,7 @@ if (!window.hemislamSay) {
     if (event.key === 'Enter' && !event.repeat && !event.isComposing && event.target.matches('.mantine-Modal-body .mantine-TextInput-input')) {
       event.target.closest('.mantine-Modal-body').querySelector('.mantine-Button-root:not([style*="gray-filled"])')?.click();
     }
+    if (event.key === 'Enter' && event.target.matches('.mantine-Paper-root[role=button]')) event.target.click();
     const taken = sideways(event) ? event.target.closest('[role=slider],[role=tab]') : event.repeat;
     if (taken || document.querySelector('.mantine-Modal-body')) event.stopPropagation();
   });
