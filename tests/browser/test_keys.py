@@ -61,6 +61,7 @@ def test_a_folder_is_reached_by_tab_and_opened_by_enter(bench: Bench) -> None:
     page.get_by_role("button", name="nothing changed").first.focus()
     page.keyboard.press("Tab")
     expect(head).to_be_focused()
+    expect(head).to_have_css("outline-style", "solid")
     page.keyboard.press("Enter")
     expect(head).to_have_attribute("aria-expanded", "true")
     page.keyboard.press("Enter")

@@ -100,7 +100,8 @@ if (!window.hemislamSay) {
     // viser's folders open by the mouse only; here Tab reaches their heads, and Enter opens and closes them.
     for (const head of document.querySelectorAll('.mantine-Paper-root[data-with-border]>.mantine-Paper-root')) {
       if (head.style.cursor !== 'pointer') continue;
-      head.tabIndex = 0; head.role = 'button'; head.ariaExpanded = !head.querySelector('.tabler-icon-chevron-down');
+      head.classList.add('hs-folder'); head.tabIndex = 0; head.role = 'button';
+      head.ariaExpanded = !head.querySelector('.tabler-icon-chevron-down');
     }
   }, 1000);
 
@@ -126,7 +127,7 @@ if (!window.hemislamSay) {
     if (event.key === 'Enter' && !event.repeat && !event.isComposing && event.target.matches('.mantine-Modal-body .mantine-TextInput-input')) {
       event.target.closest('.mantine-Modal-body').querySelector('.mantine-Button-root:not([style*="gray-filled"])')?.click();
     }
-    if (event.key === 'Enter' && event.target.matches('.mantine-Paper-root[role=button]')) event.target.click();
+    if (event.key === 'Enter' && event.target.matches('.hs-folder')) event.target.click();
     const taken = sideways(event) ? event.target.closest('[role=slider],[role=tab]') : event.repeat;
     if (taken || document.querySelector('.mantine-Modal-body')) event.stopPropagation();
   });
