@@ -52,7 +52,7 @@ class RosbagsStream:
             self.counts[topic] = (printable(connection.msgtype), before + connection.msgcount)
         times = self._log_times()
         self.start_ns, self.end_ns, self.wild = self._span(times)
-        spans = [span for kind, of in times if kind in {IMU, *CLOUD_TYPES} and (span := overlap(of))]
+        spans = [span for kind, log_ns in times if kind in {IMU, *CLOUD_TYPES} and (span := overlap(log_ns))]
         self.mixed = (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
     def messages(self, topics: tuple[str, ...], start_ns: int, stop_ns: int) -> Iterator[tuple[str, int, Any]]:
@@ -122,8 +122,8 @@ class RosbagsStream:
 
     def _span(self, times: list[tuple[str, I64]]) -> tuple[int, int, int]:
         """Log time of the first message, the end after the last, and how many are too far away to count."""
-        if any(len(of) for _, of in times):
-            return sound_span(np.concatenate([of for _, of in times]))
+        if any(len(log_ns) for _, log_ns in times):
+            return sound_span(np.concatenate([log_ns for _, log_ns in times]))
         spans = [file.metadata for file in self._files()] or self._reader.readers  # a metadata.yaml may be wrong
         start_ns, end_ns = min(one.start_time for one in spans), max(one.end_time for one in spans)
         return min(start_ns, LATEST_NS), min(end_ns, LATEST_NS), 0

@@ -88,12 +88,14 @@ def _candidates(probe: Probe, kind: CloudType, wanted: str) -> list[str]:
 
 def _seconds_and_nanoseconds(probe: Probe, lower: dict[str, str]) -> list[str]:
     """The joined names of two fields such as `timestampSec` and `timestampNsec`. lower: names by their lower case."""
-    for name in lower:
-        if found := _NANOSECONDS.fullmatch(name):
-            pair = [*[lower[one] for unit in _SECONDS if (one := found[1] + unit) in lower][:1], lower[name]]
-            integers = all(probe.cloud.fields[one][1].kind in "iu" for one in pair)
-            if len(pair) == 2 and integers and probe.column(pair[1]).max() < 1_000_000_000:
-                return [JOINED.join(pair)]
+    for name, nanoseconds in lower.items():
+        if (found := _NANOSECONDS.fullmatch(name)) is None:
+            continue
+        seconds = next((lower[found[1] + unit] for unit in _SECONDS if found[1] + unit in lower), None)
+        if seconds is None or any(probe.cloud.fields[one][1].kind not in "iu" for one in (seconds, nanoseconds)):
+            continue
+        if probe.column(nanoseconds).max() < 1_000_000_000:
+            return [f"{seconds}{JOINED}{nanoseconds}"]
     return []
 
 

@@ -194,7 +194,7 @@ class Workspace:
                 b.engine.send(Seek(before.transport.frame))
             if before.transport.playing:
                 b.engine.send(Play())
-            self._sides = (replace(b, folder=None), a)  # its files are the user's now, of other recordings as well
+            self._sides = (replace(b, folder=None), a)  # what A writes, also for other recordings, is kept
             b.engine.send(AddNote(f"Swapped: replaces {a.name}."))
 
     def discard(self) -> None:

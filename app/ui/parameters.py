@@ -213,7 +213,7 @@ class ParameterPanel:
         self._now = page.now
         self._params = params
         self._edits: dict[str, Edit] = {}
-        self._of: tuple[object, ...] = (0, None)  # engine and recording whose parameters are shown
+        self._source: tuple[object, ...] = (0, None)  # engine and recording whose parameters are shown
         self._widgets: dict[str, list[Widget]] = {}
         self._resets: dict[str, viser.GuiButtonGroupHandle] = {}
         self._sections: dict[str, dict[str, Leaf]] = {}
@@ -222,7 +222,7 @@ class ParameterPanel:
             self._sections.setdefault(group, {})[leaf.name] = leaf
         self._names = {leaf.path: spoken(leaf) for leaf in leaves()}
         self._histories: defaultdict[tuple[object, ...], ParameterHistory] = defaultdict(ParameterHistory)
-        self._history = self._histories[self._of]
+        self._history = self._histories[self._source]
         self._released = False  # whether a slider was released whose last value may still be on its way
         self._bridge = Bridge(gui, "sliders", lambda *_: setattr(self, "_released", True))
         gui.add_html(self._bridge.live(panel("released")))
@@ -258,9 +258,9 @@ class ParameterPanel:
     def draw(self, snapshot: Snapshot, tuning: bool = False) -> None:
         """Update the controls from a snapshot. tuning: whether the user is moving ground sliders."""
         now = self._now()
-        of = engine_number(snapshot), snapshot.recording.path if snapshot.recording else None
-        if of != self._of:  # these edits were for another engine or recording
-            self._of, self._history = of, self._histories[of]
+        source = engine_number(snapshot), snapshot.recording.path if snapshot.recording else None
+        if source != self._source:  # these edits were for another engine or recording
+            self._source, self._history = source, self._histories[source]
             self._edits.clear()
         for path, edit in list(self._edits.items()):
             if not edit.sent and now - edit.at >= _TYPING_S:

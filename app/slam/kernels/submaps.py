@@ -43,7 +43,7 @@ def columns(points, level, upright, yaw, position, cell, bare, tallest, plan):
 
 @njit(cache=True)
 def highest(values, places, reach):
-    """(n,) bool: at which of some places no value up to `reach` further along the axes is higher.
+    """(n,) bool: whether no value up to `reach` steps along each axis from a place is higher than the one there.
 
     values (a, b, c) f32; places (n, 3) i64: indices into them.
     """
