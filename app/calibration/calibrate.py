@@ -164,7 +164,7 @@ def calibrate(
     """
     with open_recording(path, params) as recording:
         if not recording.imu_topic:
-            raise HemislamError(f"{path} has no IMU, so there is nothing to calibrate.")
+            raise HemislamError(f"{path} has no usable IMU, so there is nothing to calibrate.")
         preset, mounting = "", built_in_mounting(recording.preset, recording.imu_topic)
         if mounting and is_mounting_unknown(params):
             preset, params = recording.preset, params.merged({"sensor": mounting})

@@ -24,6 +24,11 @@ ACCELERATION_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY
 GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 _GYROSCOPE_OPTION = "--set recording.gyroscope_unit="
 
+PARTS, LEAST_STEADY = 5, 0.5
+"""If the first samples are averaged in this many parts, 4 s each, at least this share of their norm remains: while
+walking 0.96 to 1.01 with gravity, and 0.07 without."""
+LEAST_GRAVITY = 0.5
+"""Gravity is larger than this in every unit that an IMU uses."""
 MOST_ACCEL = 200.0
 """m/s^2; a larger value is not a walking motion."""
 WINDOW_S, STRIDE_S, SPAN_S, STEPS = 0.5, 0.25, 1.0, 50
@@ -53,6 +58,15 @@ def measured(gyro: F64, accel: F64) -> Mask:
     usual = (np.abs(accel) < ABSURD).all(axis=1) & (np.abs(gyro) < ABSURD).all(axis=1)
     felt = usual & accel.any(axis=1)
     return np.asarray(felt if felt.any() else usual)
+
+
+def holds_gravity(probe: ImuProbe) -> bool:
+    """Whether the accelerations average to more than those of a walk, which cancel out. Some drivers take gravity off,
+    and some IMUs read zeros."""
+    parts = np.array_split(probe.accel, min(PARTS, len(probe.accel)))
+    steady = float(np.median([np.linalg.norm(part.mean(axis=0)) for part in parts]))
+    usual = float(np.median(np.linalg.norm(probe.accel, axis=1)))
+    return usual > LEAST_GRAVITY and steady > LEAST_STEADY * usual
 
 
 Axes = tuple[tuple[int, float], ...]

@@ -12,7 +12,7 @@ from app.sensors.clocks import clock_finding, is_copy, overlap_finding
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.distances import distance_findings
 from app.sensors.findings import Finding
-from app.sensors.imu_units import AS_RECORDED, ImuProbe, gravity_findings, settle_imu
+from app.sensors.imu_units import AS_RECORDED, ImuProbe, gravity_findings, holds_gravity, settle_imu
 from app.sensors.layout import settle_cloud
 from app.sensors.leaps import (
     AROUND_NS,
@@ -45,6 +45,13 @@ NO_IMU = Finding(
     "IMU topic",
     "corrected",
     "there is no IMU: motion is estimated from the LiDAR alone, less accurately, and not in quick turns",
+)
+NO_GRAVITY = Finding(
+    "IMU topic",
+    "needs you",
+    "its accelerations hold no gravity, so the IMU is not used: motion is estimated from the LiDAR alone, less "
+    "accurately, and not in quick turns; have the driver send raw accelerations, or start hemislam with --imu-topic "
+    "and another topic",
 )
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""
@@ -111,6 +118,13 @@ class Recording(AbstractContextManager["Recording"]):
         if chosen.imu_topic or any(topic.type in usable_types("imu") and topic.messages for topic in source.topics):
             imu_topic, topic_finding = choose_topic(source, "imu", chosen.imu_topic)
             self.imu_topic = imu_topic.name
+        imu: ImuProbe | None = None
+        imu_findings: list[Finding] = []
+        self._imu_stamped = True
+        if self.imu_topic:
+            imu, self._imu_stamped, imu_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
+            if chosen.acceleration_unit == "auto" and not holds_gravity(imu):
+                self.imu_topic, topic_finding, imu, imu_findings = "", NO_GRAVITY, None, []
         self.scan_count = lidar.messages
         self.gnss_topic = navsat_topic(source)
         self._topics = tuple(filter(None, (self.lidar_topic, self.imu_topic, self.gnss_topic)))
@@ -118,11 +132,7 @@ class Recording(AbstractContextManager["Recording"]):
         probes, probe_findings = probe_clouds(source, lidar)
         self._layout, cloud_findings = settle_cloud(probes, chosen, self.lidar_topic, CLOUD_TYPES[lidar.type])
         probes, scans = self._decode_probes(probes, cloud_findings)
-        self._imu_stamped, self._imu_units, self._leaps = True, AS_RECORDED, Leaps()
-        imu: ImuProbe | None = None
-        imu_findings: list[Finding] = []
-        if self.imu_topic:
-            imu, self._imu_stamped, imu_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
+        self._imu_units, self._leaps = AS_RECORDED, Leaps()
         self._log_after_stamp_ns = 0  # known below; places of lost messages do not matter to leaps
         self._leaps = self._find_leaps()
         source.first_scan_ns = probes[0].log_ns

@@ -13,7 +13,7 @@ from app.calibration.calibrate import is_mounting_unknown
 from app.calibration.words import table, write_beside
 from app.child import Link
 from app.sensors.presets import calibrated_beside, sidecar
-from app.sensors.recording import NO_IMU
+from app.sensors.recording import NO_GRAVITY, NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError
@@ -216,8 +216,8 @@ class CalibrationPanel:
 
 
 def _is_unknown(snapshot: Snapshot) -> bool:
-    """Whether there is an IMU, and the pose of the LiDAR on it was not given."""
-    has_imu = snapshot.recording is not None and NO_IMU not in snapshot.recording.findings
+    """Whether there is a usable IMU, and the pose of the LiDAR on it was not given."""
+    has_imu = snapshot.recording is not None and not {NO_IMU, NO_GRAVITY} & {*snapshot.recording.findings}
     return has_imu and is_mounting_unknown(snapshot.params) and not snapshot.resumed
 
 

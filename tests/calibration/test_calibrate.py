@@ -230,7 +230,7 @@ def test_a_recording_that_is_too_short_is_refused_in_a_sentence(shared_data: Pat
 
 def test_a_recording_without_an_imu_is_refused_before_it_is_read(tmp_path: Path) -> None:
     alone = [entry for entry in rig.walk(turns=60, columns=4) if entry[0] == "/points"]
-    with pytest.raises(HemislamError, match="has no IMU, so there is nothing to calibrate"):
+    with pytest.raises(HemislamError, match="has no usable IMU, so there is nothing to calibrate"):
         calibrate(rig.write(tmp_path / "walk", alone), Params())
 
 

@@ -1,14 +1,17 @@
 """Unusable recordings are refused with one sentence that says what is wrong, where, and what to do."""
 
+import math
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from app.sensors.doctor import examine
-from app.sensors.recording import open_recording
+from app.sensors.recording import NO_GRAVITY, open_recording
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
@@ -354,12 +357,27 @@ def test_a_byte_order_that_is_stated_wrongly_is_corrected(tmp_path: Path, big_en
     np.testing.assert_array_equal(first.scan.points, rig.turn(0, columns=12).points)
 
 
-def test_an_imu_that_reads_nothing_is_refused(tmp_path: Path) -> None:
+def steps_alone(stamp_ns: int) -> Any:
+    """A sample of a walk at two steps a second, without gravity."""
+    return rig.imu(stamp_ns, accel=(0.3, 0.0, 3.0 * math.sin(4.0e-9 * math.pi * (stamp_ns - rig.START_NS))))
+
+
+@pytest.mark.parametrize("felt", [steps_alone, lambda stamp_ns: rig.imu(stamp_ns, accel=(0.0, 0.0, 0.0))])
+def test_a_recording_whose_imu_feels_no_gravity_is_mapped_by_the_lidar_alone(
+    tmp_path: Path, felt: Callable[[int], Any]
+) -> None:
     entries = [
-        (topic, log, rig.imu(log, accel=(0.0, 0.0, 0.0)) if topic == "/imu" else sent)
-        for topic, log, sent in rig.walk(turns=3, columns=4)
+        (topic, log, felt(log) if topic == "/imu" else sent) for topic, log, sent in rig.walk(turns=30, columns=4)
     ]
-    assert "reads 0 on all axes" in refusal(rig.write(tmp_path / "walk", entries))
+    path = rig.write(tmp_path / "walk", entries)
+    with open_recording(path, Params()) as recording:
+        assert NO_GRAVITY in recording.findings and not recording.imu_topic
+        measured = list(recording.measurements())
+    assert len(measured) == 30 and all(isinstance(one, Measurement) and not len(one.imu) for one in measured)
+    chosen = Params().with_values({"recording.acceleration_unit": "m/s2"})
+    if felt is steps_alone:
+        with open_recording(path, chosen) as recording:
+            assert recording.imu_topic == "/imu", "whoever names the unit knows better"
 
 
 @pytest.mark.parametrize(("container", "suffix"), [("bare-mcap", ".MCAP"), ("bag", ".BAG"), ("bare-db3", ".Db3")])

@@ -1,10 +1,12 @@
 """Wrong units or axes of an IMU are detected by gravity, which must rotate as the gyroscope measures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from app.sensors.imu_units import AS_RECORDED, ImuProbe, Sway, gravity_findings, settle_imu
+from app.sensors.imu_units import AS_RECORDED, ImuProbe, Sway, gravity_findings, holds_gravity, settle_imu
 from app.slam.errors import HemislamError
 from app.slam.params import Params
 from app.slam.sections import RecordingParams
@@ -18,7 +20,7 @@ def at_rest(accel: tuple[float, ...], gyro: tuple[float, ...] = (0, 0, 0), wobbl
     return ImuProbe(stamps, stamps, np.array(gyro) + noise, np.array(accel) + 5 * noise)
 
 
-def carried() -> ImuProbe:
+def carried(gravity: float = G) -> ImuProbe:
     """20 s at 200 Hz of a device that is swung about all axes while walking, with noise: rad/s and m/s^2."""
     at = np.arange(4000) / 200.0
     angles = np.column_stack([0.4 * np.sin(1.1 * at), 0.3 * np.sin(1.7 * at + 1), 0.9 * np.sin(0.6 * at + 2)])
@@ -29,7 +31,7 @@ def carried() -> ImuProbe:
     )
     steps = np.column_stack([np.sin(11 * at), np.cos(11 * at), 2 * np.sin(22 * at)]) + rng.normal(size=(4000, 3)) * 0.1
     stamps = (at * 1e9).astype(np.int64)
-    return ImuProbe(stamps, stamps, gyro, turned.inv().apply(steps + np.array([0, 0, G])))
+    return ImuProbe(stamps, stamps, gyro, turned.inv().apply(steps + np.array([0, 0, gravity])))
 
 
 @pytest.mark.parametrize(
@@ -118,6 +120,14 @@ def test_an_accelerometer_that_reads_nothing_is_refused() -> None:
     walk = carried()
     with pytest.raises(HemislamError, match="reads 0 on all axes"):
         settle_imu(ImuProbe(walk.log_ns, walk.stamps_ns, walk.gyro, 0 * walk.accel), RecordingParams())
+
+
+def test_gravity_is_told_from_a_walk_without_it_in_every_unit() -> None:
+    walk, steps = carried(), carried(gravity=0.0).accel
+    for unit in (1.0, 1 / G, 1000 / G):
+        assert holds_gravity(replace(walk, accel=unit * walk.accel))
+        assert not holds_gravity(replace(walk, accel=unit * steps))
+    assert not holds_gravity(replace(walk, accel=np.full_like(walk.accel, 0.02))), "at rest, a bias remains"
 
 
 @pytest.mark.parametrize("axes", ["xxy", "xy", "xyzz", "--xyz", "abc", ""])
