@@ -14,7 +14,8 @@ from app.calibration.inertial import Inertial, Noise
 from app.calibration.lines import Lines, fit_lines
 from app.calibration.odometry import track
 from app.calibration.rotation import Turned, find_offset, first_rotation, fit_rotation, is_mirrored
-from app.calibration.translation import Moved, fit_translation
+from app.calibration.translation import Moved, fit_translation, is_opposed
+from app.sensors.imu_units import axes_name, named_axes
 from app.sensors.presets import built_in_mounting
 from app.sensors.recording import open_recording
 from app.slam import lie
@@ -29,7 +30,8 @@ READING, ROUND = 0.1, 0.9 / (ROUNDS + 1)
 LARGEST_ROTATION, LARGEST_PLACE, LARGEST_OFFSET = np.radians(1.0), 0.05, 0.002
 """rad, m, s: values with a larger standard deviation count as not observable."""
 NOT_TURNED = np.radians(20.0)
-"""rad: if scans alone leave every axis of the rotation this uncertain, the help of the IMU would mislead."""
+"""rad: if scans alone leave every axis of the rotation this uncertain, the help of the IMU would mislead; if any, its
+accelerations cannot be compared."""
 SURE = 3.0
 """Standard deviations by which two values must differ to count as different."""
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1
@@ -41,8 +43,8 @@ Report = Callable[[float], None]
 """A function that is called with the fraction done, 0-1."""
 
 
-class MirroredError(HemislamError):
-    """The gyroscope's axes are not those of any IMU, however it is mounted."""
+class AxesError(HemislamError):
+    """The axes of a sensor are not those of any IMU, however it is mounted."""
 
 
 def is_mounting_unknown(params: Params) -> bool:
@@ -160,7 +162,7 @@ def calibrate(
         duration_s: how much of it to use. progress: called with the fraction done, 0-1.
 
     Raises:
-        HemislamError: the recording cannot be read, has no IMU, or is too short; MirroredError.
+        HemislamError: the recording cannot be read, has no IMU, or is too short; AxesError.
     """
     with open_recording(path, params) as recording:
         if not recording.imu_topic:
@@ -191,16 +193,22 @@ def calibrate_excerpt(
     alone = way.residual
     late = find_offset(way, inertial)
     if is_mirrored(way, inertial, late):
-        raise MirroredError(
+        raise AxesError(
             f"The gyroscope in {path} turns as the LiDAR does in a mirror: one of its axes has the wrong sign, or two "
             "are exchanged; correct the driver, or set recording.gyroscope_axes to -xyz, x-yz or xy-z."
         )
     turned = fit_rotation(way, inertial, first_rotation(way, inertial, late), late, given[0])
     guide = Guide.of(inertial, turned.R_imu_lidar, turned.late, turned.bias)
     moved = fit_translation(way, inertial, turned, given[1])
+    observed = np.diag(turned.covariance)[:3] < NOT_TURNED**2
+    if observed.all() and is_opposed(way, inertial, turned, moved):
+        axes = axes_name(tuple((axis, -sign) for axis, sign in named_axes(params.recording.accelerometer_axes)))
+        raise AxesError(
+            f"The accelerometer in {path} reads the opposite of how the LiDAR moves: correct the driver, or set "
+            f"recording.accelerometer_axes to {axes}."
+        )
     lines, seen = Lines.none(excerpt.lines), excerpt
-    is_open = bool((np.diag(turned.covariance)[:3] > NOT_TURNED**2).all())
-    for number in range(0 if is_open else ROUNDS):
+    for number in range(ROUNDS if observed.any() else 0):
         way = track(seen, guide, report(number + 1))
         turned = fit_rotation(way, inertial, turned.R_imu_lidar, turned.late, given[0])
         moved = fit_translation(way, inertial, turned, given[1])

@@ -19,7 +19,7 @@ WIDEST = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])
 STEPS, SLIPPED = 20, 3.0
 """Most steps of the fit; windows whose differences exceed this many times the usual ones are errors of the odometry."""
 CLEARLY = 0.5
-"""The IMU counts as mirrored if mirroring its turns reduces their difference from the LiDAR's to less than this
+"""A sensor's sign counts as wrong if the other one reduces the difference from the LiDAR's motion to less than this
 share."""
 WINDOW = 10
 """Scans over which attitudes are compared: a second. The gyroscope's noise grows with it, the odometry's does not."""

@@ -4,13 +4,13 @@ In windows of a few scans, the IMU's accelerations, integrated twice, must give 
 initial position, a velocity and gravity in each window. All unknowns are linear, since the attitudes are already known.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.calibration.inertial import SUBSTEPS, Inertial
 from app.calibration.odometry import Track
-from app.calibration.rotation import Turned, chained, clustered, windows_of
+from app.calibration.rotation import CLEARLY, Turned, chained, clustered, windows_of
 from app.slam import lie
 from app.slam.types import F64, I64
 
@@ -78,6 +78,13 @@ def fit_translation(track: Track, inertial: Inertial, turned: Turned, given: F64
     bias, falling = _solved(design[:, :, 3:], falls, target, weights / sigma)
     before = target - design[:, :, 3:] @ bias - np.einsum("wmj,wj->wm", falls, falling)
     return Moved(x[:3], x[3:], g[0], covariance, before.reshape(-1, 3), off.reshape(-1, 3))
+
+
+def is_opposed(track: Track, inertial: Inertial, turned: Turned, moved: Moved) -> bool:
+    """Whether the accelerations fit the LiDAR's motion far better with the opposite sign; some drivers send gravity."""
+    opposite = fit_translation(track, replace(inertial, accel=-inertial.accel), turned, np.zeros(3))
+    off, right = (np.median(np.linalg.norm(fit.after, axis=1)) for fit in (opposite, moved))
+    return bool(off < CLEARLY * right)
 
 
 def _solved(design: F64, falls: F64, target: F64, weights: F64) -> tuple[F64, F64]:

@@ -128,12 +128,12 @@ def look_for_mounting(recording: Path, params: "Params") -> str:
 
 def _contradicting(recording: Path, params: "Params", title: str) -> tuple[dict[str, Any] | None, str]:
     """Values found in the recording that contradict the parameters, and a sentence on them; else None, and why."""
-    from app.calibration.calibrate import MirroredError, calibrate
+    from app.calibration.calibrate import AxesError, calibrate
 
     with progress_bar(title) as show:
         try:
             found = calibrate(recording, params, UNASKED_S, show)
-        except MirroredError as error:
+        except AxesError as error:
             return None, str(error)
         except HemislamError:  # such as too short a recording; opening it reports what is wrong with it
             return None, ""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from app.__main__ import cli
-from app.calibration.calibrate import MirroredError, calibrate, calibrate_excerpt
+from app.calibration.calibrate import AxesError, calibrate, calibrate_excerpt
 from app.calibration.excerpt import Excerpt, read_excerpt
 from app.calibration.inertial import Noise
 from app.calibration.lines import Lines
@@ -77,13 +77,20 @@ def test_a_place_alone_is_said_to_be_the_lidars(tmp_path: Path) -> None:
 
 def test_a_mirrored_gyroscope_is_named_instead_of_a_mounting(excerpt: Excerpt) -> None:
     imu = replace(excerpt.imu, gyro=excerpt.imu.gyro * [1.0, -1.0, 1.0])
-    with pytest.raises(MirroredError, match=r"in a mirror: .*gyroscope_axes to -xyz, x-yz or xy-z"):
+    with pytest.raises(AxesError, match=r"in a mirror: .*gyroscope_axes to -xyz, x-yz or xy-z"):
         calibrate_excerpt(Path("walk.mcap"), Params(), Excerpt(excerpt.scans, imu))
+
+
+def test_an_accelerometer_of_the_opposite_sign_is_named(excerpt: Excerpt) -> None:
+    imu = replace(excerpt.imu, accel=-excerpt.imu.accel)
+    set_so = Params().with_values({"recording.accelerometer_axes": "-yxz"})
+    with pytest.raises(AxesError, match=r"the opposite of how the LiDAR moves: .*accelerometer_axes to y-x-z"):
+        calibrate_excerpt(Path("walk.mcap"), set_so, Excerpt(excerpt.scans, imu))
 
 
 def test_info_and_run_tell_of_a_mirrored_gyroscope(monkeypatch: pytest.MonkeyPatch) -> None:
     def found(*_: object) -> None:
-        raise MirroredError("It is mirrored.")
+        raise AxesError("It is mirrored.")
 
     monkeypatch.setattr("app.calibration.calibrate.calibrate", found)
     assert look_for_mounting(Path("walk.mcap"), Params()) == "It is mirrored."
