@@ -87,7 +87,6 @@ def examine(
             _rate("scan rate", scans[:, 1], 4.0),
             *(of_imu if recording.imu_topic else ()),
             *_scan_time(scans, census.copies),
-            *_mixed(scans[:, 1], imu[:, 1]),
             *_of_pauses(pauses),
             _pairing(counts.paired, census.reasons),
             _returns(census, len(scans)),
@@ -275,27 +274,6 @@ def _scan_time(scans: I64, copies: int) -> list[Finding]:
     longest = float(forward.max()) / 1e9
     text = f"{wrong}; the longest interval is {longest:.3f} s" if wrong else "no scan missing or repeated"
     return [Finding("scan time", "corrected" if wrong else "fine", text)]
-
-
-def _mixed(scans: I64, imu: I64) -> list[Finding]:
-    """Whether twice as many scans and samples as usual come for a second: two parts of a walk, mixed by log time."""
-    if not len(scans) or not len(imu):
-        return []
-    begin_ns, half_ns = min(int(scans.min()), int(imu.min())), 500_000_000
-    seconds = (int(max(scans.max(), imu.max())) - begin_ns) // half_ns + 1
-    if seconds > 100_000:  # of years
-        return []
-    counts = [np.bincount((stamps - begin_ns) // half_ns, minlength=seconds) for stamps in (scans, imu)]
-    doubled = np.logical_and(*(count > 1.6 * np.median(count[count > 0]) for count in counts))
-    twice = np.flatnonzero(doubled[:-1] & doubled[1:])
-    if not len(twice):
-        return []
-    from_s, until_s = 0.5 * float(twice[0]), 0.5 * float(twice[-1] + 2)
-    text = (
-        f"from {from_s:.1f} to {until_s:.1f} s there are twice as many scans and IMU samples as usual: the recorder's "
-        "clock was set back, and what it recorded before and after that is mixed up; map the parts on either side"
-    )
-    return [Finding("clock leap", "needs you", text, f"--duration {from_s:.1f}, and --start {until_s:.1f}")]
 
 
 def _pairing(paired: int, reasons: Counter[str]) -> Finding:

@@ -128,22 +128,14 @@ def test_a_pause_is_no_leap(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("container", ["bag", "bare-db3"])
 @pytest.mark.parametrize("seconds", [-2, -7])
-def test_a_recorder_whose_clock_alone_is_set_back_is_named_where_messages_come_by_log_time(
-    tmp_path: Path, container: str, seconds: int
+@pytest.mark.parametrize("alone", [True, False])
+def test_parts_that_are_sorted_into_each_other_are_named(
+    tmp_path: Path, container: str, seconds: int, alone: bool
 ) -> None:
-    path = recorded(tmp_path / "walk", right, right, set_by(seconds), container)
-    with open_recording(path, Params()) as recording:
-        (found,) = [finding for finding in recording.findings if finding.subject == "log times"]
+    """As rosbags reads these files, if the recorder's clock is set back, alone or with those of the sensors."""
+    clock, of_sensors = set_by(seconds), right if alone else set_by(seconds)
+    path = recorded(tmp_path / "walk", of_sensors, of_sensors, clock, container)
+    (found,) = [finding for finding in examine(path, Params()) if finding.subject == "log times"]
     assert found.verdict == "needs you" and "clock was set back" in found.text
     said = re.fullmatch(r"--duration ([\d.]+), and --start ([\d.]+)", found.option)
     assert said is not None and [float(one) for one in said.groups()] == pytest.approx([12 + seconds, 12], abs=0.15)
-
-
-@pytest.mark.parametrize("container", ["bag", "bare-db3"])
-def test_parts_that_are_sorted_into_each_other_are_named(tmp_path: Path, container: str) -> None:
-    """As rosbags reads these files."""
-    clock = set_by(-2)
-    path = recorded(tmp_path / "walk", clock, clock, clock, container)
-    (leap,) = [finding for finding in examine(path, Params()) if finding.subject == "clock leap"]
-    assert leap.verdict == "needs you" and "clock was set back" in leap.text
-    assert leap.option == "--duration 10.0, and --start 12.0"
