@@ -27,7 +27,6 @@ class CloudReader:
         self._fields: dict[str, Any] = {}
         self._waiting: list[tuple[Any, Probe, int]] = []
         self._unusable = 0
-        self._reported = ""
 
     def add(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:
         """The scans that are ready after this message, each with its arrival: none at first, then all that waited.
@@ -39,9 +38,7 @@ class CloudReader:
             return self._read(message, log_ns, arrival_ns)
         except HemislamError as error:
             self._intake.counters.unreadable += 1
-            if str(error) != self._reported:
-                self._reported = str(error)
-                self._intake.put_status("configuration", "LiDAR", self._reported)
+            self._intake.put_status("configuration", "LiDAR", str(error), once=True)
             return []
 
     def _read(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:

@@ -62,7 +62,6 @@ class FoxgloveReceiver:
         self._channels: dict[int, Channel] = {}
         self._subscribed: dict[int, tuple[Sensor, Channel]] = {}
         self._reader: CloudReader | None = None
-        self._last_status = ""
         self._least_delay_ns = 0
 
     def __call__(self, stop: threading.Event) -> None:
@@ -75,12 +74,11 @@ class FoxgloveReceiver:
                 ) as connection:  # fmt: skip
                     self._intake.counters.reconnects += connected
                     connected = True
-                    self._last_status = ""
                     self._intake.put_status("connected", "source", f"connected to {self._url}")
                     self._listen(connection, stop)
             except (OSError, WebSocketException, TimeoutError) as error:
                 text = f"no connection to {self._url} ({_brief(error)}); trying again"
-                self._report("disconnected", text)
+                self._intake.put_status("disconnected", "source", text, once=True)
             stop.wait(RETRY_S)
 
     def _listen(self, connection: Connection, stop: threading.Event) -> None:
@@ -93,7 +91,8 @@ class FoxgloveReceiver:
                 message = connection.recv(timeout=0.1)
             except TimeoutError:
                 if not self._channels and time.monotonic() - begun > RETRY_S:
-                    self._report("configuration", f"{self._url} offers no topic at all; waiting for one")
+                    text = f"{self._url} offers no topic at all; waiting for one"
+                    self._intake.put_status("configuration", "source", text, once=True)
                 continue
             if isinstance(message, str):
                 if self._note(message):
@@ -149,7 +148,8 @@ class FoxgloveReceiver:
                 self._reader = CloudReader(self._intake, found.topic, CLOUD_TYPES[found.type])
                 self._intake.sensor = f"{found.topic} from {self._url}"
         if missing:
-            self._report("configuration", f"{self._url} offers {'; '.join(missing)}; waiting for it")
+            text = f"{self._url} offers {'; '.join(missing)}; waiting for it"
+            self._intake.put_status("configuration", "source", text, once=True)
 
     def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int) -> None:
         arrival = self._arrival(log_ns)
@@ -180,12 +180,6 @@ class FoxgloveReceiver:
         self._least_delay_ns = min(self._least_delay_ns, now - log_ns)
         arrival = log_ns + self._least_delay_ns
         return arrival if now - arrival < _MOST_DELAY_NS else now
-
-    def _report(self, kind: Literal["disconnected", "configuration"], text: str) -> None:
-        """Put news into the intake, but only once, however often it happens."""
-        if text != self._last_status:
-            self._last_status = text
-            self._intake.put_status(kind, "source", text)
 
 
 def _brief(error: BaseException) -> str:

@@ -50,6 +50,8 @@ _TOO_FAST_SAMPLES = 20
 """If this many samples in a row are too fast, it was not a knock."""
 _AHEAD_NS, _LATE_NS = -50_000_000, 2_000_000_000
 """If the age of stamps on arrival is between these, they are taken as the time of day."""
+_MOST_ONCE = 100
+"""Most news of one connection that are each put once: a network may hold any number of senders."""
 BUSY = "too many scans waited (mapping was paused, or slower than the scanner)"
 NO_IMU = "no IMU sample came to cover it"
 
@@ -101,7 +103,7 @@ class Intake:
         self._rest: deque[ImuEntry | DroppedScan | Status] = deque()
         self._held: deque[ScanEntry | ImuEntry] | None = deque()
         self._suspect: ImuEntry | None = None
-        self._still_reported = self._unusable_reported = False
+        self._put_once: set[str] = set()
         self._maps = {"LiDAR": ClockMap(), "IMU": ClockMap()}
         self._offset = OffsetEstimate()
         self._arrivals: dict[str, deque[int]] = {"LiDAR": deque(maxlen=50), "IMU": deque(maxlen=1000)}
@@ -128,8 +130,17 @@ class Intake:
             self._arrivals["IMU"].append(arrival_ns)
             self._put(ImuEntry(arrival_ns, stamp_ns, gyro, accel))
 
-    def put_status(self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str) -> None:
+    def put_status(
+        self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str, *, once: bool = False
+    ) -> None:
+        """Add news. once: not if it was added before, since the source was last connected."""
         with self._changed:
+            if kind == "connected" and sensor == "source":
+                self._put_once.clear()
+            if once and (text in self._put_once or len(self._put_once) == _MOST_ONCE):
+                return
+            if once:
+                self._put_once.add(text)
             self._rest.append(Status(kind, sensor, text, time.time_ns()))
             self._changed.notify()
 
@@ -228,9 +239,8 @@ class Intake:
             return False
         span_ns = abs(samples[-1].stamp_ns - samples[0].stamp_ns)
         if span_ns < _SETTLE_NS:
-            if not self._still_reported and samples[-1].log_ns - samples[0].log_ns > 5 * _SETTLE_NS:
-                self._still_reported = True
-                self.put_status("clocks", "IMU", "the IMU's stamps do not advance; check its driver")
+            if samples[-1].log_ns - samples[0].log_ns > 5 * _SETTLE_NS:
+                self.put_status("clocks", "IMU", "the IMU's stamps do not advance; check its driver", once=True)
             return False
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)
@@ -244,9 +254,7 @@ class Intake:
         try:
             self._units, findings = settle_imu(probe, self.params.recording)
         except HemislamError as error:
-            if not self._unusable_reported:
-                self._unusable_reported = True
-                self.put_status("units", "IMU", str(error))
+            self.put_status("units", "IMU", str(error), once=True)
             return False
         self.put_findings("units", "IMU", findings)
         self._unit_reported |= any("deg/s" in finding.text for finding in findings)

@@ -52,7 +52,6 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         self._heard_ns, self._heard_at = self._sequencer.newest_imu_ns, time.monotonic()
         self._silent_since: dict[str, float] = {}
         self._watched_at = 0.0
-        self._failure_reported = False
         self._threads = [
             threading.Thread(target=_run, args=(receive, intake, self._stop), daemon=True, name=f"receive-{number}")
             for number, receive in enumerate(receivers)
@@ -121,12 +120,10 @@ class LiveSource(AbstractContextManager["LiveSource"]):
             return
         self._watched_at = now
         state = self._intake.state()
-        if self._recorder is not None and not self._failure_reported:
+        if self._recorder is not None:
             slow = "the disk is too slow; some scans are missing in the recording"
-            trouble = self._recorder.failure or (slow if self._recorder.left_out else "")
-            if trouble:
-                self._failure_reported = True
-                self._events.append(Status("recording", "source", trouble, time.time_ns()))
+            if trouble := self._recorder.failure or (slow if self._recorder.left_out else ""):
+                self._intake.put_status("recording", "source", trouble, once=True)
         ages: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": state.lidar_age_s, "IMU": state.imu_age_s}
         for sensor, age in ages.items():
             if age is None or (age > SILENCE_S) == (sensor in self._silent_since):

@@ -121,7 +121,6 @@ class PacketReceiver:
         self._angles_settled = angles is not None or not device.has_angles
         self._sensor: Peer | None = None
         self._heard_s = 0.0
-        self._reported_another = self._reported_unreadable = False
 
     def __call__(self, stop: threading.Event) -> None:
         with self._opened:
@@ -154,10 +153,9 @@ class PacketReceiver:
                 self._configure(difop, now)
         else:
             self._frames += self._assembler.add(packet, now)
-            if sensor is None and not self._reported_unreadable and (other := other_sensor(packet)):
-                self._reported_unreadable = True
+            if sensor is None and (other := other_sensor(packet)):
                 text = f"{peer[0]} is {other}, whose packets are not read; take its clouds from ROS, by foxglove://"
-                self._intake.put_status("configuration", "LiDAR", text)
+                self._intake.put_status("configuration", "LiDAR", text, once=True)
 
     def _put_imu(self, samples: list[ImuSample], arrival_ns: int) -> None:
         for sample in samples:
@@ -173,10 +171,8 @@ class PacketReceiver:
         if current is None or now - self._heard_s > _REST_NS * 1e-9:
             current = None if beside else peer
         elif (peer[0] != current[0]) if beside else (peer != current):
-            if not self._reported_another:
-                self._reported_another = True
-                text = f"{peer[0]} sends to the port of {current[0]} too; its packets are left out while both send"
-                self._intake.put_status("configuration", "LiDAR", text)
+            text = f"{peer[0]} sends to the port of {current[0]} too; its packets are left out while both send"
+            self._intake.put_status("configuration", "LiDAR", text, once=True)
             return True
         if not beside:
             self._sensor, self._heard_s = current, now
