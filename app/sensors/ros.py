@@ -46,14 +46,20 @@ def read_or_lose(read: Callable[..., Any], data: bytes, *kind: str) -> Any:
 
 
 class Deserialiser:
-    """Reads messages of the standard types, and of those whose definitions it was given."""
+    """Reads messages of the standard types, and of those whose definitions it was given.
 
-    def __init__(self) -> None:
-        self._learnt: dict[str, Typestore] = {}  # by encoding
+    A standard type is read by its standard definition, whatever a file states about it.
+
+    Args:
+        learnt: other types, by encoding.
+    """
+
+    def __init__(self, learnt: dict[str, Typestore] | None = None) -> None:
+        self._learnt = learnt or {}
 
     def learn(self, kind: str, definition: str, encoding: str) -> None:
         """Read messages of this type too; a definition that makes no sense is ignored."""
-        if not definition or encoding not in ENCODINGS or self.knows(kind, encoding):
+        if not definition or kind in CUSTOM_MSGS or kind in self._store(kind, encoding).types:
             return
         store = self._learnt.setdefault(encoding, get_typestore(_STORES[encoding]))
         try:
@@ -61,10 +67,6 @@ class Deserialiser:
             store.register({name: fields for name, fields in found.items() if name not in store.types})
         except Exception:  # the parser raises errors of its own and of Python
             return
-
-    def knows(self, kind: str, encoding: str) -> bool:
-        """Whether messages of this type can be read."""
-        return encoding in ENCODINGS and (kind in CUSTOM_MSGS or kind in self._store(kind, encoding).types)
 
     def read(self, data: bytes, kind: str, encoding: str) -> Any:
         """The message. Raises whatever the library raises for bytes that are not such a message."""

@@ -42,9 +42,10 @@ class RosbagsStream:
         adapt_rosbags()
         self._links = TemporaryDirectory()  # of links whose names end as rosbags expects
         files = [self._in_small_letters(path) for path in files]
-        self._standard = Deserialiser()
         self._reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         self._reader.open()
+        self._encoding = "cdr" if self._reader.is2 else "ros1"
+        self._deserialiser = Deserialiser({self._encoding: self._reader.typestore})
         self.counts: dict[str, tuple[str, int]] = {}
         for connection in self._reader.connections:
             topic = printable(connection.topic)
@@ -62,7 +63,8 @@ class RosbagsStream:
         if not connections:  # rosbags would read all topics then
             return
         for connection, log_ns, raw in self._raw(connections, start_ns, stop_ns):
-            yield printable(connection.topic), log_ns, read_or_lose(self._deserialised, raw, connection.msgtype)
+            message = read_or_lose(self._deserialiser.read, raw, connection.msgtype, self._encoding)
+            yield printable(connection.topic), log_ns, message
 
     def _raw(self, connections: list[Any], start_ns: int, stop_ns: int) -> Iterator[tuple[Any, int, bytes]]:
         """(connection, log time ns, bytes); no bytes of damaged messages, for MCAP as `adapt_rosbags` says."""
@@ -151,13 +153,6 @@ class RosbagsStream:
         """The ROS 2 files, as rosbags has them open."""
         for storage in (getattr(reader, "storage", None) for reader in self._reader.readers if self._reader.is2):
             yield from getattr(storage, "storages", [storage])
-
-    def _deserialised(self, raw: bytes, kind: str) -> Any:
-        """The message. Standard types are read by their standard definition, whatever the file states about them."""
-        encoding = "cdr" if self._reader.is2 else "ros1"
-        if self._standard.knows(kind, encoding):
-            return self._standard.read(raw, kind, encoding)
-        return self._reader.deserialize(raw, kind)
 
     def _in_small_letters(self, path: Path) -> Path:
         if path.suffix == path.suffix.lower():
