@@ -38,7 +38,7 @@ class CloudReader:
             return self._read(message, log_ns, arrival_ns)
         except HemislamError as error:
             self._intake.counters.unreadable += 1
-            self._intake.put_status("configuration", "LiDAR", str(error), once=True)
+            self._intake.put_status("configuration", str(error), once=True)
             return []
 
     def _read(self, message: Any, log_ns: int, arrival_ns: int) -> list[tuple[Scan | DroppedScan, int]]:
@@ -74,5 +74,5 @@ class CloudReader:
         probes = stamped([probe for _, probe, _ in waiting])
         layout, findings = settle_cloud(probes, self._intake.params.recording, self._topic, self._kind)
         self._layout = layout
-        self._intake.put_findings("configuration", "LiDAR", findings)
+        self._intake.put_findings("configuration", findings)
         return [(read_scan(message, probe.log_ns, layout)[1], at) for message, probe, at in waiting]

@@ -31,7 +31,7 @@ _MOST_DELAY_NS = 800_000_000
 MESSAGE = struct.Struct("<BIQ")
 
 Sensor = Literal["lidar", "imu"]
-NAMES: dict[Sensor, Literal["LiDAR", "IMU"]] = {"lidar": "LiDAR", "imu": "IMU"}
+NAMES: dict[Sensor, str] = {"lidar": "LiDAR", "imu": "IMU"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +74,11 @@ class FoxgloveReceiver:
                 ) as connection:  # fmt: skip
                     self._intake.counters.reconnects += connected
                     connected = True
-                    self._intake.put_status("connected", "source", f"connected to {self._url}")
+                    self._intake.put_status("connected", f"connected to {self._url}")
                     self._listen(connection, stop)
             except (OSError, WebSocketException, TimeoutError) as error:
                 text = f"no connection to {self._url} ({_brief(error)}); trying again"
-                self._intake.put_status("disconnected", "source", text, once=True)
+                self._intake.put_status("disconnected", text, once=True)
             stop.wait(RETRY_S)
 
     def _listen(self, connection: Connection, stop: threading.Event) -> None:
@@ -92,7 +92,7 @@ class FoxgloveReceiver:
             except TimeoutError:
                 if not self._channels and time.monotonic() - begun > RETRY_S:
                     text = f"{self._url} offers no topic at all; waiting for one"
-                    self._intake.put_status("configuration", "source", text, once=True)
+                    self._intake.put_status("configuration", text, once=True)
                 continue
             if isinstance(message, str):
                 if self._note(message):
@@ -143,13 +143,13 @@ class FoxgloveReceiver:
             connection.send(json.dumps(request))
             others = [c.topic for c in usable if c is not found]
             hint = f"; there are also {', '.join(others)}" if others and not wanted else ""
-            self._intake.put_status("connected", NAMES[sensor], f"{NAMES[sensor]} on {found.topic}{hint}")
+            self._intake.put_status("connected", f"{NAMES[sensor]} on {found.topic}{hint}")
             if sensor == "lidar":
                 self._reader = CloudReader(self._intake, found.topic, CLOUD_TYPES[found.type])
                 self._intake.sensor = f"{found.topic} from {self._url}"
         if missing:
             text = f"{self._url} offers {'; '.join(missing)}; waiting for it"
-            self._intake.put_status("configuration", "source", text, once=True)
+            self._intake.put_status("configuration", text, once=True)
 
     def _receive(self, sensor: Sensor, channel: Channel, data: bytes, log_ns: int) -> None:
         arrival = self._arrival(log_ns)

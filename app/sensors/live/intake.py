@@ -130,25 +130,23 @@ class Intake:
             self._arrivals["IMU"].append(arrival_ns)
             self._put(ImuEntry(arrival_ns, stamp_ns, gyro, accel))
 
-    def put_status(
-        self, kind: Kind, sensor: Literal["LiDAR", "IMU", "source"], text: str, *, once: bool = False
-    ) -> None:
-        """Add news. once: not if it was added before, since the source was last connected."""
+    def put_status(self, kind: Kind, text: str, *, once: bool = False) -> None:
+        """Add news. once: not if it was added before, since a source was last connected."""
         with self._changed:
-            if kind == "connected" and sensor == "source":
+            if kind == "connected":
                 self._put_once.clear()
             if once and (text in self._put_once or len(self._put_once) == _MOST_ONCE):
                 return
             if once:
                 self._put_once.add(text)
-            self._rest.append(Status(kind, sensor, text, time.time_ns()))
+            self._rest.append(Status(kind, text))
             self._changed.notify()
 
-    def put_findings(self, kind: Kind, sensor: Literal["LiDAR", "IMU"], findings: list[Finding]) -> None:
-        """Report findings about a sensor that are not as expected."""
+    def put_findings(self, kind: Kind, findings: list[Finding]) -> None:
+        """Report findings that are not as expected."""
         for finding in findings:
             if finding.verdict != "fine":
-                self.put_status(kind, sensor, f"{finding.subject}: {finding.spoken}")
+                self.put_status(kind, f"{finding.subject}: {finding.spoken}")
 
     def end(self) -> None:
         """Record what is still held back; from now on, nothing is accepted."""
@@ -240,7 +238,7 @@ class Intake:
         span_ns = abs(samples[-1].stamp_ns - samples[0].stamp_ns)
         if span_ns < _SETTLE_NS:
             if samples[-1].log_ns - samples[0].log_ns > 5 * _SETTLE_NS:
-                self.put_status("clocks", "IMU", "the IMU's stamps do not advance; check its driver", once=True)
+                self.put_status("clocks", "the IMU's stamps do not advance; check its driver", once=True)
             return False
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         accel = np.array([sample.accel for sample in samples], np.float64)
@@ -254,9 +252,9 @@ class Intake:
         try:
             self._units, findings = settle_imu(probe, self.params.recording)
         except HemislamError as error:
-            self.put_status("units", "IMU", str(error), once=True)
+            self.put_status("units", str(error), once=True)
             return False
-        self.put_findings("units", "IMU", findings)
+        self.put_findings("units", findings)
         self._unit_reported |= any("deg/s" in finding.text for finding in findings)
         self._units_settled = True
         return True
@@ -283,15 +281,11 @@ class Intake:
                 text = (
                     f"the scans arrive {-offset:.3f} s after the IMU's samples of the same time, as over a slow network"
                 )
-                self.put_status("clocks", "source", f"{text}; the stamps are used: if they are wrong, use ?clock=host")
+                self.put_status("clocks", f"{text}; the stamps are used: if they are wrong, use ?clock=host")
             elif apart:
-                self.put_status(
-                    "clocks", "source", f"{wrong}: both are stamped by the host's clock instead, on arrival"
-                )
+                self.put_status("clocks", f"{wrong}: both are stamped by the host's clock instead, on arrival")
         elif self._clock == "sensor" and apart:
-            self.put_status(
-                "clocks", "source", f"{wrong}; use ?clock=host, or --set recording.imu_time_offset={offset:.3f}"
-            )
+            self.put_status("clocks", f"{wrong}; use ?clock=host, or --set recording.imu_time_offset={offset:.3f}")
         for clock_map in self._maps.values():
             clock_map.host = self._clock == "host"
 
@@ -327,7 +321,7 @@ class Intake:
         self._too_fast = self._too_fast + 1 if rate > TOO_FAST else 0
         if self._too_fast == _TOO_FAST_SAMPLES and not self._unit_reported:
             self._unit_reported = True
-            self.put_findings("units", "IMU", [too_fast(rate)])
+            self.put_findings("units", [too_fast(rate)])
         self._rest.append(entry)
 
     def _release_scan(self, entry: ScanEntry) -> None:
@@ -348,9 +342,8 @@ class Intake:
         if clock_map.jumped_at_ns != before:
             self.counters.jumps += 1
             self._offset.clear()
-            self.put_status(
-                "jump", name, f"the {name}'s clock was set by {clock_map.jump_ns / 1e9:+.3f} s; its time continues"
-            )
+            text = f"the {name}'s clock was set by {clock_map.jump_ns / 1e9:+.3f} s; its time continues"
+            self.put_status("jump", text)
         return mapped
 
 

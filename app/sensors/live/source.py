@@ -5,7 +5,6 @@ import time
 from collections import deque
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from app.sensors.live.intake import Intake, Receive, Settled
 from app.sensors.live.status import Kind, LiveState, Status
@@ -82,7 +81,7 @@ class LiveSource(AbstractContextManager["LiveSource"]):
 
     def tell(self, kind: Kind, text: str) -> None:
         """Add news for the thread that polls."""
-        self._intake.put_status(kind, "source", text)
+        self._intake.put_status(kind, text)
 
     def close(self) -> None:
         self._stop.set()
@@ -123,23 +122,20 @@ class LiveSource(AbstractContextManager["LiveSource"]):
         if self._recorder is not None:
             slow = "the disk is too slow; some scans are missing in the recording"
             if trouble := self._recorder.failure or (slow if self._recorder.left_out else ""):
-                self._intake.put_status("recording", "source", trouble, once=True)
-        ages: dict[Literal["LiDAR", "IMU"], float | None] = {"LiDAR": state.lidar_age_s, "IMU": state.imu_age_s}
-        for sensor, age in ages.items():
+                self._intake.put_status("recording", trouble, once=True)
+        for sensor, age in (("LiDAR", state.lidar_age_s), ("IMU", state.imu_age_s)):
             if age is None or (age > SILENCE_S) == (sensor in self._silent_since):
                 continue
             if age > SILENCE_S:
                 self._silent_since[sensor] = now - age
-                text = f"the {sensor} has been silent for {age:.1f} s"
-                self._events.append(Status("silent", sensor, text, time.time_ns()))
+                self.tell("silent", f"the {sensor} has been silent for {age:.1f} s")
             else:
-                text = f"the {sensor} is back after {now - self._silent_since.pop(sensor):.1f} s"
-                self._events.append(Status("back", sensor, text, time.time_ns()))
+                self.tell("back", f"the {sensor} is back after {now - self._silent_since.pop(sensor):.1f} s")
 
 
 def _run(receive: Receive, intake: Intake, stop: threading.Event) -> None:
     try:
         receive(stop)
     except Exception as error:  # the other threads continue; the user must know that this one does not
-        intake.put_status("disconnected", "source", f"receiving ended: {type(error).__name__}: {error}")
+        intake.put_status("disconnected", f"receiving ended: {type(error).__name__}: {error}")
         raise

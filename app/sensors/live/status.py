@@ -10,17 +10,10 @@ Kind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """An event of a source, which continues.
-
-    Attributes:
-        sensor: the affected part, "LiDAR", "IMU" or "source". text: one sentence for the user.
-        at_ns: when, by the host's clock.
-    """
+    """An event of a source, which continues. text: one sentence for the user."""
 
     kind: Kind
-    sensor: Literal["LiDAR", "IMU", "source"]
     text: str
-    at_ns: int
 
 
 @dataclass(slots=True)

@@ -155,7 +155,7 @@ class PacketReceiver:
             self._frames += self._assembler.add(packet, now)
             if sensor is None and (other := other_sensor(packet)):
                 text = f"{peer[0]} is {other}, whose packets are not read; take its clouds from ROS, by foxglove://"
-                self._intake.put_status("configuration", "LiDAR", text, once=True)
+                self._intake.put_status("configuration", text, once=True)
 
     def _put_imu(self, samples: list[ImuSample], arrival_ns: int) -> None:
         for sample in samples:
@@ -172,7 +172,7 @@ class PacketReceiver:
             current = None if beside else peer
         elif (peer[0] != current[0]) if beside else (peer != current):
             text = f"{peer[0]} sends to the port of {current[0]} too; its packets are left out while both send"
-            self._intake.put_status("configuration", "LiDAR", text, once=True)
+            self._intake.put_status("configuration", text, once=True)
             return True
         if not beside:
             self._sensor, self._heard_s = current, now
@@ -188,11 +188,11 @@ class PacketReceiver:
         self._assembler.turn_ns = round(60e9 / difop.rpm)
         self._intake.sensor = f"{self._model.name} {difop.serial}: {difop.describe()}"
         if before is not None:
-            self._intake.put_status("configuration", "LiDAR", f"the LiDAR was set to {difop.describe()}")
+            self._intake.put_status("configuration", f"the LiDAR was set to {difop.describe()}")
             return
-        self._intake.put_status("connected", "LiDAR", self._intake.sensor)
+        self._intake.put_status("connected", self._intake.sensor)
         if difop.T_imu_lidar is not None:
-            self._intake.put_status("configuration", "LiDAR", mount_finding(difop.T_imu_lidar).text)
+            self._intake.put_status("configuration", mount_finding(difop.T_imu_lidar).text)
 
     def _give(self, now: int) -> None:
         """Decode and hand on; at the start, once the angles are known or their time is up."""
@@ -204,7 +204,7 @@ class PacketReceiver:
                 return
             self._angles_settled = True
             text = "no DIFOP packet came with this unit's angles; the nominal ones are used until one comes"
-            self._intake.put_status("configuration", "LiDAR", text)
+            self._intake.put_status("configuration", text)
         while self._frames:
             frame = self._frames.popleft()
             for scan, arrival_ns in self._scans(frame):
