@@ -46,21 +46,12 @@ class Guide:
         Args:
             back: (k,) s, ascending to 0. R_world_lidar: (3, 3) at the first of these times.
         """
-        turned = np.asarray(self.R_imu_lidar.T @ self._turned(end, back)[0] @ self.R_imu_lidar)
-        return Course(back, turned, *self._swayed(end, back, R_world_lidar @ turned[0].T))
-
-    def _swayed(self, end: float, back: F64, R_world_lidar: F64) -> tuple[F64, F64]:
-        """Deviation of the LiDAR, (k, 3) m and (k, 3) m/s, from a motion at the constant velocity that it had at the
-        end; in its frame at the end.
-
-        Args:
-            back: (k,) s, ascending to 0. R_world_lidar: (3, 3) at the end.
-        """
+        turned, rates = self._turned(end, back)
+        of_lidar = np.asarray(self.R_imu_lidar.T @ turned @ self.R_imu_lidar)
         nothing = np.zeros((len(back), 3))
         if self.gravity is None:
-            return nothing, nothing
-        turned, at = self._turned(end, back)
-        R_world_imu = R_world_lidar @ self.R_imu_lidar.T
+            return Course(back, of_lidar, nothing, nothing)
+        R_world_imu = R_world_lidar @ of_lidar[0].T @ self.R_imu_lidar.T  # at the end
         felt = (turned @ self.inertial.forces(end + back)[:, :, None])[:, :, 0] + R_world_imu.T @ self.gravity
         h = np.diff(back)[:, None]
         speeds, ways = nothing.copy(), nothing.copy()  # of the IMU, integrated back from the end
@@ -68,11 +59,11 @@ class Guide:
             mean = 0.5 * (felt[k] + felt[k + 1])
             speeds[k] = speeds[k + 1] - mean * h[k]
             ways[k] = ways[k + 1] - speeds[k + 1] * h[k] + 0.5 * mean * h[k] ** 2
-        spin = lie.hat(at)
+        spin = lie.hat(rates)
         arm, whirl = self.p_imu_lidar, turned @ spin  # the LiDAR at the end of its lever
         ways = ways + turned @ arm - arm - back[:, None] * (spin[-1] @ arm)
         speeds = speeds + whirl @ arm - spin[-1] @ arm
-        return ways @ self.R_imu_lidar, speeds @ self.R_imu_lidar
+        return Course(back, of_lidar, ways @ self.R_imu_lidar, speeds @ self.R_imu_lidar)
 
     def _turned(self, end: float, back: F64) -> tuple[F64, F64]:
         """(k, 3, 3) R_end_then of the IMU, and its rates (k, 3) then."""
