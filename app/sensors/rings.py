@@ -32,13 +32,13 @@ class Rings:
         place: (step, lines): point i of the message is on line (i // step) % lines.
         rank: (lines,) uint16, rank by elevation of each value of the field or place; None: the value
             already is the rank.
-        bounds: (lines - 1,) rad, ascending, the elevations that separate the lines.
+        bounds: (lines - 1,) rad, ascending, the elevations that separate the lines; None: from field or place.
         centre: (radial, height) m, the origin of the beams to which `bounds` refer.
         of_lines: False if the sensor has no scan lines and rings are equal steps of elevation.
     """
 
     field: str | None = None
-    place: tuple[int, int] | None = None
+    place: tuple[int, int] = (1, 1)
     rank: U16 | None = None
     bounds: F64 | None = None
     centre: tuple[float, float] = (0.0, 0.0)
@@ -46,16 +46,12 @@ class Rings:
 
     def of(self, cloud: CloudMessage, points: F32, index: npt.NDArray[np.intp]) -> U16:
         """(n,) uint16 ring of the kept points, whose places in the message are `index`."""
-        if self.field is not None:
-            raw = values_at(cloud.column(self.field), index).astype(np.uint16)
-        elif self.place is not None:
-            step, lines = self.place
-            raw = (index // step % lines).astype(np.uint16)
-        elif self.bounds is not None:
+        if self.bounds is not None:
             return np.searchsorted(self.bounds, elevation(points, self.centre)).astype(np.uint16)
-        else:
-            return np.zeros(len(points), np.uint16)
-        return raw if self.rank is None else self.rank.take(np.minimum(raw, len(self.rank) - 1))
+        step, lines = self.place
+        raw = index // step % lines if self.field is None else values_at(cloud.column(self.field), index)
+        number = raw.astype(np.uint16)
+        return number if self.rank is None else self.rank.take(np.minimum(number, len(self.rank) - 1))
 
 
 def elevation(points: F32, centre: tuple[float, float] = (0.0, 0.0)) -> F32:
@@ -84,12 +80,8 @@ def settle_rings(probes: list[Probe], kind: CloudType, names: dict[str, str]) ->
         why = "the clouds have no ring field"
     if not kind.rings:
         return _settle_steps(points, why)
-    by_place = _settle_place(probes)
-    if by_place is not None:
-        rings, lines = by_place
-        return rings, Finding(
-            "ring order", "corrected", f"{why}; the order of the points shows {lines} scan lines, ranked by elevation"
-        )
+    if (by_place := _settle_place(probes, why)) is not None:
+        return by_place
     bounds, centre = _settle_elevation(points)
     lines = len(bounds) + 1
     if lines >= _LEAST_LINES:
@@ -147,24 +139,22 @@ def _settle_field(field: str, raw: I64, angles: F32, lines: int) -> tuple[Rings,
     return Rings(field, rank=_ranked(present, medians, lines)), Finding("ring order", "corrected", text)
 
 
-def _settle_place(probes: list[Probe]) -> tuple[Rings, int] | None:
+def _settle_place(probes: list[Probe], why: str) -> tuple[Rings, Finding] | None:
     """Row-major rows, or lines interleaved in firing order, if either explains the elevations."""
     first = probes[0].cloud
-    total = len(first)
     layouts = [(first.width, first.height), (1, first.height)] if 4 <= first.height <= 256 else []
-    layouts += [(1, lines) for lines in _COMMON_LINES if total % lines == 0 and (1, lines) not in layouts]
+    layouts += [(1, lines) for lines in _COMMON_LINES if len(first) % lines == 0 and (1, lines) not in layouts]
+    alike = len({(probe.cloud.height, probe.cloud.width) for probe in probes}) == 1
+    far = [_far(probe.points) for probe in probes]
+    index = np.concatenate([probe.index[some] for probe, some in zip(probes, far, strict=True)])
+    angles = np.concatenate([elevation(probe.points[some]) for probe, some in zip(probes, far, strict=True)])
     for step, lines in layouts:
-        shapes = {(s.cloud.height, s.cloud.width) for s in probes}
-        if step != 1 and len(shapes) > 1:
-            continue
-        far = [_far(probe.points) for probe in probes]
-        raw = np.concatenate([s.index[f] // step % lines for s, f in zip(probes, far, strict=True)])
-        angles = np.concatenate([elevation(s.points[f]) for s, f in zip(probes, far, strict=True)])
+        raw = index // step % lines
         present, medians = _line_medians(raw, angles)
-        if len(present) < max(3, lines // 2):
-            continue
-        if _spread(raw, angles) < 0.25:
-            return Rings(place=(step, lines), rank=_ranked(present, medians, lines)), lines
+        if (alike or step == 1) and len(present) >= max(3, lines // 2) and _spread(raw, angles) < 0.25:
+            text = f"{why}; the order of the points shows {lines} scan lines, ranked by elevation"
+            rings = Rings(place=(step, lines), rank=_ranked(present, medians, lines))
+            return rings, Finding("ring order", "corrected", text)
     return None
 
 
