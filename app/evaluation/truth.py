@@ -221,7 +221,7 @@ def _read_topic(recording: Path, topic: str) -> TruePoses:
                 f"Topic {topic} is of type {kind}, which is not a truth; use one of type {', '.join(TYPES)}."
             )
         stamps, rows = [], []
-        for _, _, message in source.messages((topic,)):
+        for _, message in source.readable(topic):
             row = fix_of(message).places[0] if kind == NAVSAT else _pose(_POSES[kind](message))
             if kind != NAVSAT or np.isfinite(row).all():
                 stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)

@@ -56,7 +56,7 @@ def recorded_fixes(recording: Path) -> Fixes:
         topic = navsat_topic(source)
         if not topic:
             raise HemislamError(f"{recording} has no topic of type {NAVSAT} with fixes; give a file of fixes.")
-        every = [fix_of(message) for _, _, message in source.messages((topic,))]
+        every = [fix_of(message) for _, message in source.readable(topic)]
     columns = ("stamps_ns", "places", "sigmas")
     fixes = Fixes(*(np.concatenate([getattr(fix, name) for fix in every]) for name in columns))
     return fixes.sound(f"Topic {topic} of {recording}")

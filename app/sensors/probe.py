@@ -76,7 +76,7 @@ def choose_topic(source: Source, sensor: Literal["lidar", "imu"], wanted: str) -
 def _content(source: Source, topic: Topic) -> int:
     """How much of the needed content a topic's first messages hold. Clouds of a depth camera, or clouds that a program
     has registered, have neither times nor rings, and some IMUs send accelerations and rates on two topics."""
-    first = [message for _, _, message in islice(_readable(source.messages((topic.name,))), 5)]
+    first = [message for _, message in islice(_until_damage(source.readable(topic.name)), 5)]
     if topic.type == IMU:
         accel, gyro = (np.array([imu_values(message)[part] for message in first]) for part in (1, 0))
         return int(accel.any()) + int(gyro.any())
@@ -97,7 +97,7 @@ def probe_clouds(source: Source, topic: Topic) -> tuple[list[Probe], list[Findin
     """
     probes: list[Probe] = []
     unusable, reason = 0, ""
-    for _, log_ns, message in _readable(source.messages((topic.name,))):
+    for log_ns, message in _until_damage(source.readable(topic.name)):
         try:
             probe = Probe(log_ns, CLOUD_TYPES[topic.type].read(message))
             if not {"x", "y", "z"} <= probe.cloud.fields.keys():
@@ -136,7 +136,7 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
         HemislamError: all of them are NaN.
     """
     logs, stamps, values = [], [], []
-    for _, log_ns, message in _readable(source.messages((topic,))):
+    for log_ns, message in _until_damage(source.readable(topic)):
         logs.append(log_ns)
         stamps.append(stamp_ns(message.header.stamp))
         values.append(imu_values(message))
@@ -162,7 +162,7 @@ def _stamp_findings(stamps: list[int], topic: str) -> list[Finding]:
     return [Finding("stamps", "corrected", text)]
 
 
-def _readable(entries: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
+def _until_damage(entries: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
     """The entries up to where the file cannot be read any further; reading the recording reports that later."""
     some = False
     try:

@@ -238,7 +238,7 @@ class Recording(AbstractContextManager["Recording"]):
     ) -> Iterator[Entry]:
         """Entries of some topics that were logged within [log_first, log_stop)."""
         offset_ns = round(self.params.recording.imu_time_offset * 1e9)
-        for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after, lost=True):
+        for topic, log_ns, message in self._source.messages(topics, log_first, log_stop, after):
             if isinstance(message, Lost):
                 stamp = log_ns + added_ns(self._leaps.log, log_ns) - self._log_after_stamp_ns
                 at_s = (log_ns - self._source.start_ns) / 1e9

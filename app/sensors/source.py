@@ -102,19 +102,17 @@ class Source(AbstractContextManager["Source"]):
         start_ns: int | None = None,
         stop_ns: int | None = None,
         after: Mark | None = None,
-        *,
-        lost: bool = False,
     ) -> Iterator[tuple[str, int, Any]]:
         """(topic, log time ns, deserialised message) of these topics, logged within [start, stop).
 
+        It is `Lost` for each message that cannot be read. Those of a damaged chunk of an MCAP have the time at which it
+        begins, which may be before `start`.
+
         Args:
             after: the last message of an earlier call with the same arguments; this call continues from there.
-            lost: give `Lost` for each message that cannot be read; otherwise these are left out. Those of a damaged
-                chunk of an MCAP are given with the time at which it begins, which may be before `start`.
 
         Raises:
-            HemislamError: the file cannot be read beyond this place, where all earlier messages have been given; or
-                all of its messages would be left out.
+            HemislamError: the file cannot be read beyond this place, where all earlier messages have been given.
         """
         first, stop = start_ns or 0, LATEST_NS + 1 if stop_ns is None else stop_ns
         if after is None:
@@ -125,22 +123,24 @@ class Source(AbstractContextManager["Source"]):
         else:
             stream = islice(self._stream.messages(topics, first, stop), after.read, None)
         log_ns = self.start_ns if after is None else after.log_ns
-        left_out, given = "", lost
-        while True:
-            try:
-                entry = next(stream, None)
-            except Exception as error:  # rosbags lets errors of zstd, lz4, sqlite, struct and assert pass
-                raise self._damaged(log_ns, brief(error)) from error
-            if entry is None:
-                break
-            log_ns = entry[1]
-            if lost or not isinstance(entry[2], Lost):
-                given = True
+        try:
+            for entry in stream:
+                log_ns = entry[1]
                 yield entry
+        except Exception as error:  # rosbags lets errors of zstd, lz4, sqlite, struct and assert pass
+            raise self._damaged(log_ns, brief(error)) from error
+
+    def readable(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """(log time ns, message) of a topic, without what cannot be read. Raises HemislamError also if nothing can."""
+        given, why = False, ""
+        for _, log_ns, message in self.messages((topic,)):
+            if isinstance(message, Lost):
+                why = why or message.why
             else:
-                left_out = left_out or entry[2].why
-        if left_out and not given:
-            raise self._damaged(self.start_ns, left_out)
+                given = True
+                yield log_ns, message
+        if why and not given:
+            raise self._damaged(self.start_ns, why)
 
     def _damaged(self, log_ns: int, why: str) -> HemislamError:
         """That nothing can be read after this log time."""

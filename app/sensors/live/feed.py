@@ -212,7 +212,7 @@ def _feed_foxglove(path: Path, topics: tuple[str, ...], to: Address, pace: Pace,
             stop_ns = None if duration_s is None else source.start_ns + round(duration_s * 1e9)
 
             def sending() -> Iterator[Sent]:
-                for topic, log_ns, said in source.messages(topics, None, stop_ns, lost=True):
+                for topic, log_ns, said in source.messages(topics, None, stop_ns):
                     if isinstance(said, ros.Lost):
                         pace.lost(said.why)
                     else:
