@@ -48,8 +48,7 @@ class Recorder:
         self._log_ns = 0
         self._waiting: deque[ScanEntry | ImuEntry] = deque()
         self._scans_waiting = 0
-        self._wake = threading.Event()
-        self._closing = False
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="recorder")
         self._thread.start()
 
@@ -64,8 +63,7 @@ class Recorder:
 
     def close(self) -> None:
         """Write the waiting messages and the end of the file."""
-        self._closing = True
-        self._wake.set()
+        self._closing.set()
         self._thread.join(30.0)
 
     def _run(self) -> None:
@@ -73,8 +71,7 @@ class Recorder:
             with self._file:
                 closing = False
                 while not closing:
-                    self._wake.wait(FLUSH_S)
-                    closing = self._closing
+                    closing = self._closing.wait(FLUSH_S)
                     while self._waiting:
                         try:
                             self._write(self._waiting.popleft())
