@@ -21,7 +21,7 @@ from app.sensors.live.livox_udp import read_points
 from app.sensors.live.msop import other_sensor
 from app.sensors.robosense import Model
 from app.slam.errors import HemislamError
-from app.slam.types import DroppedScan, Scan
+from app.slam.types import Scan
 
 BUFFER_BYTES = 16 << 20
 """Buffer size requested from the kernel, so that no packet is lost while this process is busy; it may grant less."""
@@ -207,17 +207,15 @@ class PacketReceiver:
             self._intake.put_status("configuration", text)
         while self._frames:
             frame = self._frames.popleft()
-            for scan, arrival_ns in self._scans(frame):
+            if self._decoder is not None:
+                ready = [(self._decoder.decode(frame), frame.arrival_ns)]
+            else:
+                ready = self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns)
+            for scan, arrival_ns in ready:
                 self._intake.put_scan(scan, arrival_ns)
                 if isinstance(scan, Scan) and not self._intake.sensor:
                     without = "" if self._decoder is None else ", without device packets"
                     self._intake.sensor = f"{frame.model.name}{without}"
-
-    def _scans(self, frame: Revolution) -> list[tuple[Scan | DroppedScan, int]]:
-        """The scans that can be given now, each with its arrival."""
-        if self._decoder is None:
-            return self._clouds.add(read_points(frame.packets), int(frame.stamps_ns[0]), frame.arrival_ns)
-        return [(self._decoder.decode(frame), frame.arrival_ns)]
 
 
 class ImuReceiver:
