@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -136,17 +137,14 @@ class Recording(AbstractContextManager["Recording"]):
         self._log_after_stamp_ns = 0  # known below; places of lost messages do not matter to leaps
         self._leaps = self._find_leaps()
         source.first_scan_ns = probes[0].log_ns
-        self.start_ns = scans[0].stamp_ns + added_ns(self._leaps.lidar, probes[0].log_ns)
-        log_start_ns = int(self.log_times(np.array([probes[0].log_ns]))[0])
-        self._log_after_stamp_ns = log_start_ns - self.start_ns
-        self._leaps_told = leap_sentences(self._leaps, log_start_ns)
-        lasts_ns = max(source.end_ns - log_start_ns, 0) + scans[0].end_ns - scans[0].stamp_ns
-        self.duration_s = lasts_ns / 1e9
         scan_times = np.array([(p.log_ns, s.stamp_ns, s.end_ns) for p, s in zip(probes, scans, strict=True)], np.int64)
         scan_times[:, 1:] += all_added_ns(self._leaps.lidar, scan_times[:, 0])[:, None]
         scan_times[:, 0] = self.log_times(scan_times[:, 0])
-        before: list[Scan | None] = [None, *scans[:-1]]
-        once = [not is_copy(scan, last) for scan, last in zip(scans, before, strict=True)]
+        log_start_ns, self.start_ns, first_end_ns = scan_times[0].tolist()
+        self._log_after_stamp_ns = log_start_ns - self.start_ns
+        self._leaps_told = leap_sentences(self._leaps, log_start_ns)
+        self.duration_s = (max(source.end_ns - log_start_ns, 0) + first_end_ns - self.start_ns) / 1e9
+        once = [True, *(not is_copy(scan, before) for before, scan in pairwise(scans))]
         self._clocks = Finding("clocks", "fine", "there is one only")
         self.preset = preset_for(lidar.type, probes[0])
         if imu is not None:
