@@ -22,19 +22,12 @@ from app.sensors.live.pcap import Datagram
 from app.sensors.log_times import LATEST_NS
 from app.slam import lie
 from app.slam.errors import HemislamError
-from app.slam.types import F64, I64, U8
+from app.slam.types import F64, I64
 
 LIDAR_TOPIC, IMU_TOPIC = "/ouster/points", "/ouster/imu"
 _IMU = np.dtype([("system", "<u8"), ("accel_ns", "<u8"), ("gyro_ns", "<u8"), ("accel", "<f4", 3), ("gyro", "<f4", 3)])
 """The legacy IMU packet: g and deg/s."""
-_POINT = np.dtype(
-    {
-        "names": ["x", "y", "z", "t", "reflectivity", "ring"],
-        "formats": ["<f4", "<f4", "<f4", "<u4", "<u2", "<u2"],
-        "offsets": [0, 4, 8, 12, 16, 18],
-        "itemsize": 20,
-    }
-)
+_POINT = np.dtype([*((axis, "<f4") for axis in "xyz"), ("t", "<u4"), ("reflectivity", "<u2"), ("ring", "<u2")])
 MOST_COLUMNS = 4096
 """Most columns of a turn, in the finest mode of any Ouster."""
 LATE = 4
@@ -62,6 +55,14 @@ class _Profile:
     footer: int
     pixel: int
     returns: tuple[_Return, ...]
+
+    def packet(self, columns: int, rows: int) -> np.dtype[Any]:
+        """A packet: columns with their time, place in the turn, status and a pixel in each row."""
+        size = self.column_header + rows * self.pixel + self.column_end
+        status_at, status = (size - 4, "<u4") if self.column_end else (10, "<u2")
+        pixels = (f"V{self.pixel}", (rows,)), self.column_header
+        column = _layout(size, time=("<u8", 0), place=("<u2", 8), status=(status, status_at), pixels=pixels)
+        return _layout(self.header + columns * size + self.footer, columns=((column, (columns,)), self.header))
 
 
 _PROFILES = {
@@ -130,14 +131,9 @@ class Metadata:
             )
         return found
 
-    @property
-    def column_bytes(self) -> int:
-        profile = self.profile
-        return profile.column_header + len(self.elevations) * profile.pixel + profile.column_end
-
-    @property
-    def packet_bytes(self) -> int:
-        return self.profile.header + self.columns * self.column_bytes + self.profile.footer
+    @cached_property
+    def packet(self) -> np.dtype[Any]:
+        return self.profile.packet(self.columns, len(self.elevations))
 
     @cached_property
     def rays(self) -> tuple[F64, F64]:
@@ -205,7 +201,7 @@ class OusterStream(PacketStream):
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         """Raises CaptureError: the file is no capture."""
-        super().__init__(path, lambda packet: len(packet) == metadata.packet_bytes)
+        super().__init__(path, lambda packet: len(packet) == metadata.packet.itemsize)
         self._metadata, self._topics = metadata, {list: LIDAR_TOPIC, bytes: IMU_TOPIC}
         scans = samples = missing = 0
         for _, content in self._index(list):
@@ -258,43 +254,38 @@ class OusterStream(PacketStream):
 
     def _cloud(self, packets: list[bytes]) -> Any:
         """The message of a scan, stamped at its first column."""
-        meta, profile = self._metadata, self._metadata.profile
-        whole = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), meta.packet_bytes)
-        columns = whole[:, profile.header : profile.header + meta.columns * meta.column_bytes]
-        columns = np.ascontiguousarray(columns).reshape(-1, meta.column_bytes)
-        times = _column(columns, 0, "<u8").astype(np.int64)
-        place = _column(columns, 8, "<u2").astype(np.int64)
-        status = _column(columns, meta.column_bytes - 4, "<u4") if profile.column_end else _column(columns, 10, "<u2")
-        fits = ((status & 1) == 1) & (place < meta.width) & (times > 0)
-        columns, times, place = columns[fits], times[fits], place[fits]
+        meta = self._metadata
+        columns = np.frombuffer(b"".join(packets), meta.packet)["columns"].ravel()
+        times = columns["time"].astype(np.int64)
+        fits = ((columns["status"] & 1) == 1) & (columns["place"] < meta.width) & (times > 0)
+        columns, times = columns[fits], times[fits]
         if not len(times):
             return ros.points_message(np.empty(0, _POINT), 0, "os_lidar")
-        parts = [self._points(columns, times, place, one) for one in profile.returns]
+        parts = [self._points(columns, times, one) for one in meta.profile.returns]
         return ros.points_message(np.concatenate(parts), int(times.min()), "os_lidar")
 
-    def _points(self, columns: U8, times: I64, place: I64, of: _Return) -> Any:
+    def _points(self, columns: Any, times: I64, of: _Return) -> Any:
         """(n,) points of one return."""
-        meta, profile = self._metadata, self._metadata.profile
-        rows = len(meta.elevations)
-        pixels = columns[:, profile.column_header : profile.column_header + rows * profile.pixel]
-        pixels = np.ascontiguousarray(pixels).reshape(-1, profile.pixel)
-        ranges = (_column(pixels, of.at, of.layout) & of.bits).astype(np.float64).reshape(-1, rows) * of.unit_mm
+        meta = self._metadata
+        parts = _layout(meta.profile.pixel, range=(of.layout, of.at), reflectivity=("u1", of.reflectivity_at))
+        pixels = columns["pixels"].view(parts)
+        ranges = (pixels["range"] & of.bits).astype(np.float64) * of.unit_mm
         column, row = np.nonzero(ranges)
         directions, origins = meta.rays
-        where = place[column]
+        where = columns["place"][column]
         xyz = directions[where, row] * (ranges[column, row] - meta.origin_mm)[:, None] + origins[where, 0]
         points = np.zeros(len(row), _POINT)
         points["x"], points["y"], points["z"] = (xyz * 0.001).T
         points["t"] = np.minimum(times[column] - times.min(), np.iinfo(np.uint32).max)
-        points["reflectivity"] = pixels[:, of.reflectivity_at].reshape(-1, rows)[column, row]
+        points["reflectivity"] = pixels["reflectivity"][column, row]
         points["ring"] = row
         return points
 
 
-def _column(rows: U8, at: int, layout: str) -> Any:
-    """(n,) numbers at an offset of rows (n, bytes)."""
-    size = np.dtype(layout).itemsize
-    return np.ascontiguousarray(rows[:, at : at + size]).view(layout)[:, 0]
+def _layout(size: int, **fields: tuple[Any, int]) -> np.dtype[Any]:
+    """A structure of this many bytes, with fields of these types at these places."""
+    formats, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": [*fields], "formats": [*formats], "offsets": [*offsets], "itemsize": size})
 
 
 def _imu_message(packet: bytes) -> Any:
