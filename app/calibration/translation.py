@@ -7,6 +7,7 @@ initial position, a velocity and gravity in each window. All unknowns are linear
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from app.calibration.inertial import SUBSTEPS, Inertial
 from app.calibration.odometry import Track
@@ -90,18 +91,15 @@ def is_opposed(track: Track, inertial: Inertial, turned: Turned, moved: Moved) -
 def _solved(design: F64, falls: F64, target: F64, weights: F64) -> tuple[F64, F64]:
     """Common unknowns, and gravity (w, 3) of each window, which changes little from one to the next."""
     w, m, k = design.shape
-    rows = np.zeros((w * m + 3 * (w - 1) + 3, k + 3 * w))
-    values = np.zeros(len(rows))
-    for i in range(w):
-        part = slice(i * m, (i + 1) * m)
-        rows[part, :k] = design[i] * weights[i]
-        rows[part, k + 3 * i : k + 3 * i + 3] = falls[i] * weights[i]
-        values[part] = target[i] * weights[i]
-    for i in range(w - 1):
-        part = slice(w * m + 3 * i, w * m + 3 * i + 3)
-        rows[part, k + 3 * i : k + 3 * i + 3] = -np.eye(3) / TILT
-        rows[part, k + 3 * i + 3 : k + 3 * i + 6] = np.eye(3) / TILT
-    rows[-3:, k - 3 : k] = np.eye(3) / BIAS
+    each = weights[:, None, None]
+    rows = np.vstack(
+        [
+            np.hstack([(design * each).reshape(w * m, k), block_diag(*(falls * each))]),
+            np.hstack([np.zeros((3 * (w - 1), k)), np.kron(np.diff(np.eye(w), axis=0), np.eye(3)) / TILT]),
+            np.eye(3, k + 3 * w, k - 3) / BIAS,
+        ]
+    )
+    values = np.append(target * weights[:, None], np.zeros(3 * w))
     x = np.linalg.lstsq(rows, values, rcond=None)[0]
     return np.asarray(x[:k]), np.asarray(x[k:].reshape(w, 3))
 
