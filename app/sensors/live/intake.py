@@ -198,7 +198,7 @@ class Intake:
             self._release(entry)
         else:
             self._held.append(entry)
-            if self._settled():
+            if self._settle():
                 held, self._held = self._held, None
                 for waiting in held:
                     self._release(waiting)
@@ -210,8 +210,8 @@ class Intake:
             self._rest.popleft()
         self._changed.notify()
 
-    def _settled(self) -> bool:
-        """Decide unit and clock once there are a second of IMU samples and a few scans. Holds 10 s at most."""
+    def _settle(self) -> bool:
+        """Decide unit and clock; False until a second of IMU samples and a few scans are held, for 10 s at most."""
         assert self._held is not None
         while len(self._held) > MAX_HELD or self._held[-1].log_ns - self._held[0].log_ns > 10 * _SETTLE_NS:
             old = self._held.popleft()
@@ -230,9 +230,9 @@ class Intake:
 
     def _settle_units(self) -> bool:
         """Whether the units are known, once there is a second of samples."""
-        if self._units_settled or self._held is None:
+        if self._units_settled:
             return True
-        samples = [entry for entry in self._held if isinstance(entry, ImuEntry)]
+        samples = [entry for entry in self._held or () if isinstance(entry, ImuEntry)]
         if len(samples) < 20:
             return False
         span_ns = abs(samples[-1].stamp_ns - samples[0].stamp_ns)
