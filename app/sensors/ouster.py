@@ -61,8 +61,8 @@ class _Profile:
         size = self.column_header + rows * self.pixel + self.column_end
         status_at, status = (size - 4, "<u4") if self.column_end else (10, "<u2")
         pixels = (f"V{self.pixel}", (rows,)), self.column_header
-        column = _layout(size, time=("<u8", 0), place=("<u2", 8), status=(status, status_at), pixels=pixels)
-        return _layout(self.header + columns * size + self.footer, columns=((column, (columns,)), self.header))
+        column = ros.structure(size, time=("<u8", 0), place=("<u2", 8), status=(status, status_at), pixels=pixels)
+        return ros.structure(self.header + columns * size + self.footer, columns=((column, (columns,)), self.header))
 
 
 _PROFILES = {
@@ -267,7 +267,7 @@ class OusterStream(PacketStream):
     def _points(self, columns: Any, times: I64, of: _Return) -> Any:
         """(n,) points of one return."""
         meta = self._metadata
-        parts = _layout(meta.profile.pixel, range=(of.layout, of.at), reflectivity=("u1", of.reflectivity_at))
+        parts = ros.structure(meta.profile.pixel, range=(of.layout, of.at), reflectivity=("u1", of.reflectivity_at))
         pixels = columns["pixels"].view(parts)
         ranges = (pixels["range"] & of.bits).astype(np.float64) * of.unit_mm
         column, row = np.nonzero(ranges)
@@ -280,12 +280,6 @@ class OusterStream(PacketStream):
         points["reflectivity"] = pixels["reflectivity"][column, row]
         points["ring"] = row
         return points
-
-
-def _layout(size: int, **fields: tuple[Any, int]) -> np.dtype[Any]:
-    """A structure of this many bytes, with fields of these types at these places."""
-    formats, offsets = zip(*fields.values(), strict=True)
-    return np.dtype({"names": [*fields], "formats": [*formats], "offsets": [*offsets], "itemsize": size})
 
 
 def _imu_message(packet: bytes) -> Any:

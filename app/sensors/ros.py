@@ -269,6 +269,11 @@ def _point_type(timestamp: str, ground: bool) -> np.dtype[Any]:
     columns = {"x": ("<f4", 0), "y": ("<f4", 4), "z": ("<f4", 8), "intensity": ("<f4", 12), "ring": ("<u2", 16)}
     if ground:
         columns["ground"] = ("u1", 18)
-    columns["timestamp"] = (timestamp, 20 if ground else 18)
-    formats, offsets = zip(*columns.values(), strict=True)
-    return np.dtype({"names": [*columns], "formats": [*formats], "offsets": [*offsets], "itemsize": offsets[-1] + 8})
+    at = 20 if ground else 18
+    return structure(at + 8, **columns, timestamp=(timestamp, at))
+
+
+def structure(size: int, **fields: tuple[Any, int]) -> np.dtype[Any]:
+    """A structure of this many bytes, with fields of these types at these places."""
+    formats, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": [*fields], "formats": [*formats], "offsets": [*offsets], "itemsize": size})

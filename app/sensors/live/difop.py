@@ -1,14 +1,15 @@
 """DIFOP, the packet in which a RoboSense states its settings and calibration; and calibrations from CSV."""
 
 import csv
-import struct
 from dataclasses import astuple, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from app.sensors.live.msop import PACKET_BYTES, date_bytes
 from app.sensors.robosense import AIRY, BPEARL, Model
+from app.sensors.ros import structure
 from app.slam import lie
 from app.slam.errors import HemislamError
 from app.slam.types import F64, U16
@@ -16,10 +17,7 @@ from app.slam.types import F64, U16
 DIFOP_PORT = 7788
 DIFOP_ID = bytes.fromhex("a5ff005a11115555")
 RETURN_MODES = ("dual", "strongest", "last")
-_ANGLES = np.dtype([("sign", "u1"), ("value", ">u2")])
-_ANGLES_AT, _REVERSE_AT, _POSE_AT = 468, 337, 1092
-_POSE = struct.Struct(">7f")
-"""Quaternion x, y, z, w and position in m of the IMU in the LiDAR's frame; an Airy's."""
+_ANGLE = np.dtype([("sign", "u1"), ("value", ">u2")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,44 +80,41 @@ def read_difop(packet: bytes, model: Model = BPEARL) -> Difop | None:
     """The content of a packet of this model; None if it is not a DIFOP packet."""
     if len(packet) != PACKET_BYTES or packet[:8] != DIFOP_ID:
         return None
-    rpm, begin, end = (int(struct.unpack_from(">H", packet, at)[0]) for at in (8, 32, 34))
-    elevations, horizontal = (_read_angles(packet, at, model.channels) for at in _angles_at(model))
+    (said,) = np.frombuffer(packet, _layout(model))
+    rpm, begin, end, mode = (int(said[name]) for name in ("rpm", "begin", "end", "mode"))
+    elevations, horizontal = (_read_angles(said[name]) for name in ("elevations", "horizontal"))
     calibration = None
     # A unit without calibration sends invalid signs, or zeros, which cannot be elevations.
     if elevations is not None and elevations.any() and np.abs(elevations).max() <= 91.0:
         calibration = ChannelAngles(elevations, np.zeros(model.channels) if horizontal is None else horizontal)
-    mode = packet[300]
     return Difop(
         rpm=rpm if 60 <= rpm <= 6000 else 600,
         fov_deg=(begin / 100.0, end / 100.0) if begin != end else (0.0, 360.0),
-        serial=packet[292:298].hex(),
+        serial=said["serial"].tobytes().hex(),
         return_mode=RETURN_MODES[mode] if mode < len(RETURN_MODES) else RETURN_MODES[1],
-        reverse=model is not AIRY and packet[_REVERSE_AT] != 0,
+        reverse=model is not AIRY and bool(said["reverse"]),
         calibration=calibration,
-        T_imu_lidar=_read_pose(packet) if model is AIRY else None,
+        T_imu_lidar=_read_pose(said["pose"]) if model is AIRY else None,
     )
 
 
 def write_difop(difop: Difop, stamp_ns: int, model: Model = BPEARL) -> bytes:
     """The packet that states these settings."""
-    packet = bytearray(PACKET_BYTES)
-    packet[:8] = DIFOP_ID
-    struct.pack_into(">H", packet, 8, difop.rpm)
-    struct.pack_into(">HH", packet, 32, *(round(angle * 100) for angle in difop.fov_deg))
-    packet[292:298] = bytes.fromhex(difop.serial or "000000000000")[:6]
-    packet[300] = RETURN_MODES.index(difop.return_mode)
-    packet[303:313] = date_bytes(stamp_ns)
-    packet[_REVERSE_AT] = difop.reverse
-    elevations_at, horizontal_at = _angles_at(model)
+    packet = np.zeros((), _layout(model))
+    packet["mark"], packet["date"] = np.void(DIFOP_ID), np.void(date_bytes(stamp_ns))
+    packet["rpm"], packet["mode"] = difop.rpm, RETURN_MODES.index(difop.return_mode)
+    packet["begin"], packet["end"] = (round(angle * 100) for angle in difop.fov_deg)
+    packet["serial"] = np.void(bytes.fromhex(difop.serial or "000000000000")[:6])
+    packet["reverse"] = difop.reverse
     if difop.calibration is None:
-        packet[elevations_at : horizontal_at + 3 * model.channels] = b"\xff" * (6 * model.channels)
+        packet["elevations"] = packet["horizontal"] = np.array((0xFF, 0xFFFF), _ANGLE)
     else:
-        _write_angles(packet, elevations_at, difop.calibration.elevations_deg)
-        _write_angles(packet, horizontal_at, difop.calibration.horizontal_deg)
+        packet["elevations"] = _written_angles(difop.calibration.elevations_deg)
+        packet["horizontal"] = _written_angles(difop.calibration.horizontal_deg)
     if difop.T_imu_lidar is not None:
         T_lidar_imu = lie.inverse(difop.T_imu_lidar)
-        _POSE.pack_into(packet, _POSE_AT, *lie.quaternion(T_lidar_imu[:3, :3]), *T_lidar_imu[:3, 3])
-    return bytes(packet)
+        packet["pose"] = *lie.quaternion(T_lidar_imu[:3, :3]), *T_lidar_imu[:3, 3]
+    return packet.tobytes()
 
 
 def read_angles(path: Path) -> ChannelAngles:
@@ -145,29 +140,32 @@ def read_angles(path: Path) -> ChannelAngles:
     return ChannelAngles(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
 
 
-def _angles_at(model: Model) -> tuple[int, int]:
-    """Offsets in the packet at which elevations and horizontal corrections begin."""
-    return _ANGLES_AT, _ANGLES_AT + 3 * model.channels
+def _layout(model: Model) -> np.dtype[Any]:
+    """A packet of this model. pose: of the IMU in the LiDAR's frame, quaternion x, y, z, w and position in m."""
+    angles, at = (_ANGLE, (model.channels,)), 468
+    return structure(
+        PACKET_BYTES, mark=("V8", 0), rpm=(">u2", 8), begin=(">u2", 32), end=(">u2", 34), serial=("V6", 292),
+        mode=("u1", 300), date=("V10", 303), reverse=("u1", 337), elevations=(angles, at),
+        horizontal=(angles, at + 3 * model.channels), pose=((">f4", (7,)), 1092),
+    )  # fmt: skip
 
 
-def _read_angles(packet: bytes, at: int, channels: int) -> F64 | None:
-    table = np.frombuffer(packet, _ANGLES, channels, at)
+def _read_angles(table: Any) -> F64 | None:
     if (table["sign"] > 1).any():
         return None
     angles: F64 = np.where(table["sign"] == 0, 1.0, -1.0) * table["value"] * 0.01
     return angles
 
 
-def _write_angles(packet: bytearray, at: int, angles_deg: F64) -> None:
-    table = np.zeros(len(angles_deg), _ANGLES)
-    table["sign"] = angles_deg < 0
-    table["value"] = np.rint(np.abs(angles_deg) * 100)
-    packet[at : at + table.nbytes] = table.tobytes()
+def _written_angles(angles_deg: F64) -> Any:
+    table = np.zeros(len(angles_deg), _ANGLE)
+    table["sign"], table["value"] = angles_deg < 0, np.rint(np.abs(angles_deg) * 100)
+    return table
 
 
-def _read_pose(packet: bytes) -> F64 | None:
+def _read_pose(numbers: Any) -> F64 | None:
     """(4, 4) T_imu_lidar; None if the numbers cannot be a pose within a sensor."""
-    *quaternion, x, y, z = _POSE.unpack_from(packet, _POSE_AT)
+    *quaternion, x, y, z = numbers.tolist()
     if not abs(np.linalg.norm(quaternion) - 1.0) < 0.01 or not np.abs([x, y, z]).max() < 1.0:
         return None
     return lie.inverse(lie.transform(lie.matrix(np.array(quaternion)), np.array([x, y, z])))
