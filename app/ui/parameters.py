@@ -225,7 +225,6 @@ class ParameterPanel:
         self._history = self._histories[self._source]
         self._released = False  # whether a slider was released whose last value may still be on its way
         self._bridge = Bridge(gui, "sliders", lambda *_: setattr(self, "_released", True))
-        gui.add_html(self._bridge.live(panel("released")))
         self._opened = params
         self._recording: Path | None = None
         gui.add_html(heading("Ground segmentation"))

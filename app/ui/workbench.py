@@ -30,7 +30,7 @@ from app.ui.colours import DIMMED, Rgb
 from app.ui.compare import ComparePanel, Sides
 from app.ui.files import FilesPanel, RecentPanel
 from app.ui.georeference import GeoreferencePanel
-from app.ui.html import panel, render
+from app.ui.html import render
 from app.ui.live import LivePanel
 from app.ui.loops.panel import LoopsPanel
 from app.ui.map_compare import MapComparePanel
@@ -101,7 +101,7 @@ class Workbench:
         legend = gui.add_html("")
         files = FilesPanel(page, folders, results)
         self._recent = RecentPanel(page, folders, results / "sessions", files.browse)
-        gui.add_html(Bridge(gui, "opened", lambda tab, _: self._opened(tab)).live(panel("opened")))
+        Bridge(gui, "opened", lambda tab, _: self._opened(tab))
         tabs = gui.add_tab_group()
         with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             self._sides = Sides(gui, forks)

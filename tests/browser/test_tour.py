@@ -63,7 +63,9 @@ def test_who_may_only_view_is_not_told_what_to_try(bench: Bench, chromium: Brows
 
 def test_what_is_asked_for_in_the_same_moment_all_arrives(bench: Bench) -> None:
     bench.engine.sent.clear()
-    bench.page.evaluate("for (const word of ['cover 66', 'speed 2×', 'step 1', 'cover 70']) hemislamTransport(word)")
+    bench.page.evaluate(
+        "for (const word of ['cover 66', 'speed 2×', 'step 1', 'cover 70']) hemislamTell('transport', word)"
+    )
     bench.eventually(lambda: StepFrame(1) in bench.engine.sent)
     assert SetSpeed(2.0) in bench.engine.sent
 
@@ -82,7 +84,7 @@ def test_a_word_of_the_page_does_not_take_the_place_of_what_a_slider_was_set_to(
             await null; // the slider is drawn, but no timer fires
           }
           busy(100); // viser's timer and ours are both late
-          hemislamSay({type: 'click', target: document.querySelector('.hs-released')});
+          hemislamTell('sliders', 'released');
           busy(200);
         }"""
     )

@@ -23,10 +23,10 @@ if (!window.hemislamTour) {
     const timer = setInterval(outline, 500);
     const playing = () => { const now = JSON.parse(document.querySelector('.hs-state').dataset.state); return now.playing && !now.live; };
     const held = playing(); // pause while the user reads
-    if (held) window.hemislamTransport('pause');
+    if (held) hemislamTell('transport', 'pause');
     const end = () => {
       clearInterval(timer); outlined?.classList.remove('hs-outlined'); box.remove(); seen(); window.removeEventListener('keydown', key);
-      if (held) window.hemislamTransport('resume');
+      if (held) hemislamTell('transport', 'resume');
     };
     const key = (event) => { if (event.key === 'Escape') end(); };
     const show = () => {

@@ -16,12 +16,7 @@ const paint = () => { // in the colours of the theme
   [TEXT, QUIET, GOOD, BAD, NOTE] = ['text', 'quiet', 'good', 'bad', 'warn'].map((n) => style.getPropertyValue('--hs-' + n));
   draw(); mark();
 };
-const tell = (word) => {
-  dock.dataset.hs = word;
-  window.hemislamSay({type: 'click', target: dock});
-  delete dock.dataset.hs;
-};
-window.hemislamTransport = tell;
+const tell = (word) => hemislamTell('transport', word);
 
 const unpack = (data) => new Float32Array(Uint8Array.from(atob(data), (c) => c.charCodeAt(0)).buffer);
 const read = () => {

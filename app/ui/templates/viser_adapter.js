@@ -1,6 +1,6 @@
 // Runs once in each page. What it relies on in viser's page is listed in app/ui/viser_adapter.py.
 if (!window.hemislamSay) {
-  // A click (or Enter) on an element with data-hs: write its word into the hidden field, whose changes viser sends.
+  // A click (or Enter) on an element with data-hs: write its word into its bridge's hidden field, whose changes viser sends.
   // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, of
   // all controls together. So a word waits until nothing has changed for as long, not even by the word before; of two
   // words that ask for the same thing the later one counts, but every press that asks for a step does. On a busy page
@@ -31,14 +31,17 @@ if (!window.hemislamSay) {
     }
     sendWhenQuiet();
   };
-  window.hemislamSay = (event) => {
-    const element = event.target.closest && event.target.closest('[data-hs]');
-    if (!element || (event.type === 'keydown' && (event.key !== 'Enter' || element.tagName === 'BUTTON'))) return;
-    const name = element.closest('[data-hs-to]').dataset.hsTo, word = element.dataset.hs;
-    if (event.detail > 1 && /^(delete|drop) /.test(word)) return; // of a double click, the second one meets the next line
-    const [kind] = word.split(' '), press = kind === 'step' && !event.held ? ++presses : '';
+  window.hemislamTell = (name, word, held = false) => {
+    const [kind] = word.split(' '), press = kind === 'step' && !held ? ++presses : '';
     waiting.set(`${name} ${kind} ${press}`, [name, word]);
     sendWhenQuiet();
+  };
+  window.hemislamSay = (event) => {
+    const element = event.target.closest?.('[data-hs]');
+    if (!element || (event.type === 'keydown' && (event.key !== 'Enter' || element.tagName === 'BUTTON'))) return;
+    const word = element.dataset.hs;
+    if (event.detail > 1 && /^(delete|drop) /.test(word)) return; // of a double click, the second one meets the next line
+    hemislamTell(element.closest('[data-hs-to]').dataset.hsTo, word);
   };
 
   // For the same reason a click on one of viser's buttons waits until what was typed before it has been sent.
@@ -77,16 +80,12 @@ if (!window.hemislamSay) {
     if (event.key !== 'Escape' || isBox(event.target) || document.querySelector('.mantine-Combobox-dropdown:not([style*="display: none"])')) return;
     const modals = document.querySelectorAll('.mantine-Modal-body'), last = modals[modals.length - 1];
     if (last) [...last.querySelectorAll('button')].findLast((one) => /^(Cancel|Close)$/.test(one.textContent.trim()))?.click();
-    else opened('');
+    else hemislamTell('opened', '');
   });
 
   // The server is told which tab is opened, and of Escape.
-  const opened = (word) => {
-    const target = document.querySelector('.hs-opened');
-    if (target) { target.dataset.hs = word; window.hemislamSay({type: 'click', target}); }
-  };
   new MutationObserver((changes) => {
-    for (const {target: tab} of changes) if (tab.role === 'tab' && tab.ariaSelected === 'true') opened(tab.textContent.trim());
+    for (const {target: tab} of changes) if (tab.role === 'tab' && tab.ariaSelected === 'true') hemislamTell('opened', tab.textContent.trim());
   }).observe(document.body, {subtree: true, attributeFilter: ['aria-selected']});
 
   // viser's own buttons beside the title have icons only.
@@ -136,7 +135,7 @@ if (!window.hemislamSay) {
     event.stopPropagation();
     if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest('input,textarea,select')) return;
     const target = document.querySelector(`body > * .hs-dock [data-hs="step ${event.key === 'ArrowRight' ? 1 : -1}"]:enabled`);
-    if (target) window.hemislamSay({type: 'click', target, held: event.repeat}); // a held key steps as fast as the page can
+    if (target) hemislamTell('transport', target.dataset.hs, event.repeat); // a held key steps as fast as the page can
   });
   // Space plays and pauses. Firefox would also click the focused button again when the key comes up.
   document.documentElement.addEventListener('keyup', (event) => {
@@ -146,9 +145,7 @@ if (!window.hemislamSay) {
   // A slider that is let go ends one step of undo, once its last value has been sent.
   document.addEventListener('pointerdown', (event) => {
     if (!event.target.closest('.mantine-Slider-root')) return;
-    window.addEventListener('pointerup', () => setTimeout(() => {
-      for (const target of document.querySelectorAll('.hs-released')) window.hemislamSay({type: 'click', target});
-    }, 500), {once: true, capture: true});
+    window.addEventListener('pointerup', () => setTimeout(hemislamTell, 500, 'sliders', 'released'), {once: true, capture: true});
   }, true);
 
   // A tooltip stands beside its panel, over the scene: above its control it would hide the one before.
