@@ -127,12 +127,8 @@ def is_readable(kind: str, raw: bytes) -> bool:
     return all(isinstance(n, int | float) and math.isfinite(n) and abs(n) < 1e12 for n in numbers)
 
 
-def page_html() -> str:
-    """viser's page with our title and our limits on point sizes."""
-    return with_point_sizes(CLIENT.read_text(encoding="utf-8")).replace(TITLE, "<title>hemislam</title>", 1)
-
-
-def viewer_html(page: str) -> str:
-    """The same page with a badge that marks it as view only."""
+def page_html(*parts: str) -> str:
+    """viser's page with our title, our limits on point sizes, and parts at the end of its body."""
+    page = with_point_sizes(CLIENT.read_text(encoding="utf-8")).replace(TITLE, "<title>hemislam</title>", 1)
     head, body_end, rest = page.rpartition(BODY_END)
-    return f"{head}{BADGE}{body_end}{rest}"
+    return f"{head}{''.join(parts)}{body_end}{rest}"

@@ -31,7 +31,7 @@ from app.server.bridge import bridge
 from app.server.folders import Folders
 from app.server.fork import Workspace
 from app.server.setup import Setup
-from app.server.viser_adapter import Viser, page_html, start_viser, viewer_html
+from app.server.viser_adapter import BADGE, Viser, page_html, start_viser
 from app.server.worker import EngineProcess, RunningEngine
 from app.slam.errors import HemislamError
 
@@ -46,6 +46,8 @@ MOST_CONNECTIONS: Final = 500
 class ServedPage(Protocol):
     """Draws the session into viser; implemented by `app.ui.workbench.Workbench`."""
 
+    @property
+    def parts(self) -> str: ...
     def start(self) -> None: ...
     def close(self) -> None: ...
 
@@ -60,8 +62,8 @@ class _AsciiJson(JSONResponse):
         return json.dumps(content).encode("ascii")
 
 
-def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Access) -> FastAPI:
-    """The application with everything that can be reached from outside."""
+def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Access, parts: str = "") -> FastAPI:
+    """The application with everything that can be reached from outside. parts: HTML that belongs into viser's page."""
     app = FastAPI(
         title="hemislam",
         version=__version__,
@@ -70,8 +72,7 @@ def make_app(engine: RunningEngine, folders: Folders, target: Viser, access: Acc
         redoc_url=None,
     )
     app.add_middleware(Guard, access=access)
-    page = page_html()
-    viewers_page = viewer_html(page)
+    page, viewers_page = page_html(parts), page_html(parts, BADGE)
     pages: Counter[bool] = Counter()  # open pages, by whether they are view-only
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
@@ -148,7 +149,7 @@ def run_server(
         page = build_page(target.server, workspace, folders)
         page.start()
         cleanup.callback(page.close)
-        server = make_server(make_app(workspace, folders, target, access), tls)
+        server = make_server(make_app(workspace, folders, target, access, page.parts), tls)
         address, *others = links(host, access)
         print(f"hemislam is at {address} (Ctrl-C ends it)", flush=True)
         for other in others:

@@ -19,7 +19,7 @@ from app.server.protocol import (
     Snapshot,
     StepFrame,
 )
-from app.ui.html import number, panel, source
+from app.ui.html import number, panel
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import PANEL_PERIOD_S, Changes, Page, add_command, as_set, limited, show
 
@@ -36,9 +36,7 @@ SPEEDS: Final = {
 
 
 class TransportPanel:
-    """The bar: HTML that `templates/transport.js` moves to the scene's lower edge.
-
-    The strips of `app.ui.timeline` unfold above it.
+    """The bar, which `templates/transport.js` draws; the strips of `app.ui.timeline` unfold above it.
 
     choose_ends: called with the ends of the colour bar chosen by the user, in percent of all values.
     cover: called with a browser and the percentage of its scene's height that the bar and the strips hide.
@@ -55,7 +53,6 @@ class TransportPanel:
         self._cover = cover
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._bridge = Bridge(gui, "transport", self._asked)
-        gui.add_html(self._bridge.live(panel("transport", list(SPEEDS), source("transport.js"))))
         self._state = gui.add_html("")
         add_command(gui, "Play or pause", lambda _: self.toggle(), hotkey="space")
         # Their keys are in `viser_adapter.js`: the list of commands would show them as "arrowright".

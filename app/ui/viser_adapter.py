@@ -20,7 +20,7 @@ viser has no events for HTML and no way to run a script, and it has keys of its 
   icons list-search and adjustments. The box of a slider follows its track, with Mantine's class names.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import viser
 
@@ -28,10 +28,11 @@ from app.ui.html import panel, source
 from app.ui.widgets import by_user
 
 
-def prepare_page(gui: viser.GuiApi) -> None:
-    """Add the style sheet and the script that everything else here relies on. Call it before other HTML is added."""
+def page_parts(speeds: Iterable[str]) -> str:
+    """HTML of ours beside viser's panel: the style sheets, the bar with these speeds, and the scripts."""
     styles = source("style.css") + source("viser_adapter.css")
-    gui.add_html(panel("page_head", styles, source("viser_adapter.js") + source("tour.js") + source("drop.js")))
+    scripts = [source(f"{name}.js") for name in ("viser_adapter", "transport", "tour", "drop")]
+    return panel("page_parts", styles, list(speeds), scripts)
 
 
 class Bridge:

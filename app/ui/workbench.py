@@ -45,9 +45,9 @@ from app.ui.scene import Scene
 from app.ui.status import DoctorPanel, HeaderPanel, NoticePanel
 from app.ui.study import StudyPanel
 from app.ui.timeline import TimelinePanel
-from app.ui.transport import BreakpointPanel, TransportPanel
+from app.ui.transport import SPEEDS, BreakpointPanel, TransportPanel
 from app.ui.tune import TunePanel
-from app.ui.viser_adapter import Bridge, prepare_page
+from app.ui.viser_adapter import Bridge, page_parts
 from app.ui.widgets import PANEL_PERIOD_S, SCENE_PERIOD_S, Changes, Page, View
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,12 @@ class Workbench:
         results: folder below which results are saved.
         now: monotonic seconds. calibrate: begin calibrations automatically where they help.
         resolve: see `CalibrationPanel`.
+
+    Attributes:
+        parts: HTML that belongs into viser's page.
     """
+
+    parts: Final = page_parts(SPEEDS)
 
     def __init__(
         self,
@@ -92,7 +97,6 @@ class Workbench:
         self._scene = Scene(server, point_budget)
         page = Page(server, forks.send, lambda: forks.snapshot, now, lambda: self._scene.offset)
 
-        prepare_page(gui)
         self._header, scale = HeaderPanel(gui), ScaleBars(page)
         self._transport = TransportPanel(
             page, lambda low, high: self._appearance.choose_ends(low, high), self._scene.framing.cover

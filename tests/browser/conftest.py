@@ -19,7 +19,9 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from app.server.folders import Folders
 from app.server.fork import Workspace
 from app.server.protocol import StepFrame
+from app.server.viser_adapter import Viser
 from app.ui.workbench import Workbench
+from tests.server.server_site import serving
 from tests.ui.conftest import icons_read_once  # noqa: F401 - a fixture
 from tests.ui.fake_engine import FakeEngine
 from tests.ui.fake_forks import alone
@@ -198,15 +200,15 @@ def opened(
     workbench = Workbench(server, forks, Folders([folder]))
     workbench.start()
     page = new_page(chromium, width, height)
-    url = f"http://127.0.0.1:{server.get_port()}/"
-    page.goto(url)
-    expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
-    bench = Bench(server, workbench, engine, page, url)
-    if camera is not None:
-        bench.look(*camera)
-    yield bench
-    workbench.close()
-    page.close()
+    with serving(forks, Viser(server, ""), folder, None, parts=workbench.parts) as site:
+        page.goto(site.url())
+        expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+        bench = Bench(server, workbench, engine, page, site.url())
+        if camera is not None:
+            bench.look(*camera)
+        yield bench
+        workbench.close()
+        page.close()
     server.stop()
 
 

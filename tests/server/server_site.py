@@ -53,10 +53,11 @@ def serving(
     token: str | None,
     viewer_token: str | None = None,
     tls: Tls | None = None,
+    parts: str = "",
 ) -> Iterator[Site]:
     listener = listen("127.0.0.1", 0)
     access = Access(listener.getsockname()[1], token, viewer_token, secure=tls is not None)
-    server = make_server(make_app(engine, Folders([folder]), target, access), tls)
+    server = make_server(make_app(engine, Folders([folder]), target, access, parts), tls)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

@@ -144,6 +144,11 @@ def test_visers_page_has_what_the_adapter_replaces() -> None:
         assert part in page, f"viser's page has no {part}; the title or the view-only badge will be missing."
 
 
+def test_parts_of_ours_are_at_the_end_of_the_body_of_visers_page() -> None:
+    page = viser_adapter.page_html("<b>ours</b>", viser_adapter.BADGE)
+    assert page.partition(f"</div>\n  <b>ours</b>{viser_adapter.BADGE}</body>")[2].strip() == "</html>"
+
+
 @pytest.mark.parametrize("name", sorted(NEVER | VIEWER_MESSAGES | {"FileTransferStartUpload", "FileTransferPart"}))
 def test_viser_has_the_messages_that_the_bridge_decides_about(name: str) -> None:
     assert hasattr(viser._messages, name), (

@@ -247,6 +247,7 @@ from app.server.setup import Setup
 from app.server.worker import EngineProcess
 
 class Page:
+    parts = ""
     def __init__(self, viser, engine, folders): self.engine = engine
     def start(self): print("engine", self.engine._sides[0].engine.pid, flush=True)
     def close(self): print("page closed", flush=True)

@@ -9,7 +9,7 @@ import pytest
 import viser
 
 from app.ui.html import source
-from app.ui.viser_adapter import Bridge, prepare_page
+from app.ui.viser_adapter import Bridge, page_parts
 from tests.ui.conftest import Wire, user_sets
 
 CLIENT = Path(viser.__file__).parent / "client" / "src"
@@ -102,12 +102,11 @@ def test_viser_s_page_is_built_as_the_adapter_assumes(sentence: str) -> None:
 
 
 def test_a_bridge_is_a_text_field_followed_by_its_mark(server: viser.ViserServer, wire: Wire) -> None:
-    prepare_page(server.gui)
     words: list[str] = []
     bridge = Bridge(server.gui, "test", lambda word, _: words.append(word))
     kinds = [(type(message).__name__, message.props.order) for message in wire.messages if hasattr(message, "props")]
-    (_, page), (field, first), (mark, second) = kinds
-    assert (field, mark) == ("GuiTextMessage", "GuiHtmlMessage") and page < first < second
+    (field, first), (mark, second) = kinds
+    assert (field, mark) == ("GuiTextMessage", "GuiHtmlMessage") and first < second
     assert 'class="hs-bridge" data-name="test"' in wire.messages[-1].props.content
     user_sets(bridge._field, "choose 3 5 #17ab")
     user_sets(bridge._field, "delete 0 door #2 #27cd")
@@ -115,10 +114,12 @@ def test_a_bridge_is_a_text_field_followed_by_its_mark(server: viser.ViserServer
     assert 'data-hs-to="test"' in bridge.live("<b>x</b>")
 
 
-def test_the_page_s_script_and_styles_are_sent_and_cannot_end_their_element_early() -> None:
-    for name in ("style.css", "viser_adapter.css"):
-        assert "</style" not in source(name)
-    assert "hemislamSay" in source("viser_adapter.js")
+def test_the_page_s_scripts_and_styles_are_in_it_and_cannot_end_their_element_early() -> None:
+    parts, names = page_parts(["1×"]), ("viser_adapter", "transport", "tour", "drop")
+    for name in ("style.css", "viser_adapter.css", *(f"{name}.js" for name in names)):
+        assert source(name) in parts
+        assert not any(end in source(name) for end in ("</style", "</script", "</body"))
+    assert parts.index("hs-dock") < parts.index("<script")
 
 
 PRIVATE = ("._impl", "._websock", "._gui_", "_broadcast_buffer", "mantine", "viser._")

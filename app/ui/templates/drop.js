@@ -1,6 +1,4 @@
 // Dropped files are copied into the first folder in pieces that fit into a request; then the recording opens.
-if (!window.hemislamDrop) {
-  window.hemislamDrop = true;
   const PIECE = 1 << 19;
   const RECORDING = /\.(mcap|bag|db3|pcap|pcapng|hemislam)$/i;
   let box = null, busy = false;
@@ -65,4 +63,3 @@ if (!window.hemislamDrop) {
     }
     busy = false;
   });
-}

@@ -1,5 +1,4 @@
 // A one-minute tour of the page on the first visit. The element described is outlined; Esc or Skip ends the tour.
-if (!window.hemislamTour) {
   const STEPS = [
     ['.hs-steps', '', 'Play, or step', 'Space plays and pauses; ← and → step one frame. Going back keeps the map and your edits.'],
     ['.hs-track', '', 'Go anywhere', 'Drag the track. Its marks show loops, notes and trouble; open Diagnostics to see what the trouble was.'],
@@ -44,7 +43,7 @@ if (!window.hemislamTour) {
     box.className = 'hs-tour hs';
     box.setAttribute('role', 'dialog');
     box.setAttribute('aria-label', 'Tour');
-    window.addEventListener('keydown', key); // `window.`, or the listener would be this image's
+    window.addEventListener('keydown', key);
     document.body.append(box);
     show();
   };
@@ -52,8 +51,7 @@ if (!window.hemislamTour) {
   const wait = () => { // until a recording is open
     const node = document.querySelector('.hs-state');
     if (!first() || document.querySelector('.hs-view-only')) return; // a view-only page cannot try these steps
-    if (node && JSON.parse(node.dataset.state).open && document.querySelector('body > * .hs-transport')) window.hemislamTour();
+    if (node && JSON.parse(node.dataset.state).open) window.hemislamTour();
     else setTimeout(wait, 1000);
   };
   setTimeout(wait, 1500);
-}

@@ -1,14 +1,10 @@
 // The bar at the scene's lower edge and the strips above it: draws them, handles the pointer, and sends the user's
 // requests to the server (see viser_adapter.js).
-if (!this.isConnected) return; // a copy that the page has already removed
-const dock = this.parentElement, mover = dock.closest('[data-hs-to]'), home = mover.parentElement;
+const dock = document.querySelector('.hs-dock'), mover = dock.parentElement;
 const shell = dock.querySelector('.hs-tl'), canvas = shell.querySelector('canvas'), pen = canvas.getContext('2d');
 const bar = dock.querySelector('.hs-transport'), [play, fold, speed] = ['.hs-play', '.hs-fold', '.hs-speed'].map((c) => bar.querySelector(c));
 const slider = bar.querySelector('input'), when = bar.querySelector('.hs-when');
 const marks = bar.querySelector('.hs-track canvas'), ink = marks.getContext('2d');
-mover.home = home;
-window.hemislamDock = mover;
-for (const old of document.querySelectorAll('body > [data-hs-to]')) if (old.querySelector('.hs-dock')) old.remove();
 const HEAD = 20, NAME = 78, VALUE = 72, ROW = 19, HELD_MS = 1000;
 let TEXT, QUIET, GOOD, BAD, NOTE, d = null, text = '', hover = null, scrubbing = false, said = 0, touched = -HELD_MS, covered = -1;
 const paint = () => { // in the colours of the theme
@@ -165,7 +161,7 @@ const mark = () => { // above the track: loops, notes and beginnings of trouble
 const PAUSE = 'M6 5h4v14H6zM14 5h4v14h-4z', PLAY = play.querySelector('path').getAttribute('d');
 const show = () => {
   const node = document.querySelector('.hs-state');
-  if (!node) return;
+  dock.hidden = false;
   const now = JSON.parse(node.dataset.state), held = performance.now() - touched < HELD_MS;
   when.innerHTML = now.words;
   slider.max = now.last;
@@ -193,31 +189,28 @@ const unfold = (open) => {
 fold.onclick = () => unfold(shell.hidden);
 const settle = () => {
   const scene = document.querySelector('canvas[data-engine]');
-  if (!home.isConnected) { mover.remove(); return; }
-  const other = window.hemislamDock !== mover && window.hemislamDock;
-  if (other && other.home.isConnected) mover.remove(); // viser has made the panel twice: show the newest
-  else if (scene) {
-    window.hemislamDock = mover;
-    const box = scene.getBoundingClientRect(), phone = innerWidth < 577;
-    if (mover.parentElement !== document.body) { document.body.append(mover); dock.hidden = false; }
-    Object.assign(mover.style, {position: 'fixed', zIndex: 11, left: box.left + (phone ? 0 : 8) + 'px',
-      width: box.width - (phone ? 0 : 16) + 'px', bottom: phone ? 0 : innerHeight - box.bottom + 8 + 'px'});
-    dock.classList.toggle('narrow', box.width < 800); dock.classList.toggle('wrapped', box.width < 700);
-    const sheet = phone && document.querySelector('[style*="max-height: 60%"]'), high = dock.offsetHeight;
-    const style = document.documentElement.style;
-    const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
-    put('--hs-beside', innerWidth - box.right); put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
-    const above = box.bottom + 8 - dock.getBoundingClientRect().top, hidden = Math.round(100 * Math.max(0, above / box.height) || 0);
-    if (hidden !== covered) { covered = hidden; tell('cover ' + hidden); }
-  }
-  setTimeout(settle, 300);
+  if (!scene || dock.hidden) return;
+  const box = scene.getBoundingClientRect(), phone = innerWidth < 577;
+  Object.assign(mover.style, {position: 'fixed', zIndex: 11, left: box.left + (phone ? 0 : 8) + 'px',
+    width: box.width - (phone ? 0 : 16) + 'px', bottom: phone ? 0 : innerHeight - box.bottom + 8 + 'px'});
+  dock.classList.toggle('narrow', box.width < 800); dock.classList.toggle('wrapped', box.width < 700);
+  const sheet = phone && document.querySelector('[style*="max-height: 60%"]'), high = dock.offsetHeight;
+  const style = document.documentElement.style;
+  const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
+  put('--hs-beside', innerWidth - box.right); put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
+  const above = box.bottom + 8 - dock.getBoundingClientRect().top, hidden = Math.round(100 * Math.max(0, above / box.height) || 0);
+  if (hidden !== covered) { covered = hidden; tell('cover ' + hidden); }
 };
 new ResizeObserver(paint).observe(dock);
-const watch = (name, act) => {
-  const node = document.querySelector(name);
-  if (!node) { if (home.isConnected) setTimeout(() => watch(name, act), 200); return; }
-  new MutationObserver(act).observe(node.parentElement, {childList: true});
-  act();
+const watch = (name, act) => { // also after viser has made the panel again, as for another server
+  let place = null;
+  setInterval(() => {
+    const node = document.querySelector(name);
+    if (!node || node.parentElement === place) return;
+    place = node.parentElement; covered = -1;
+    new MutationObserver(() => { if (document.querySelector(name)) act(); }).observe(place, {childList: true});
+    act();
+  }, 200);
 };
 new MutationObserver(paint).observe(document.documentElement, {attributes: true});
 const copy = (name) => () => { dock.querySelector(name).innerHTML = document.querySelector(name + '-data').innerHTML; };
@@ -237,4 +230,4 @@ legend.onchange = () => { choose(ends().map((end) => Number(end.value))); setTim
 legend.ondblclick = () => choose([0, 100]);
 watch('.hs-legend-data', explain);
 watch('.hs-tl-data', read); watch('.hs-state', show); unfold(localStorage.getItem('hemislam-diagnostics') === 'open');
-settle();
+setInterval(settle, 300);

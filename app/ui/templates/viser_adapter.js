@@ -1,5 +1,4 @@
-// Runs once in each page. What it relies on in viser's page is listed in app/ui/viser_adapter.py.
-if (!window.hemislamSay) {
+// What this relies on in viser's page is listed in app/ui/viser_adapter.py.
   // A click (or Enter) on an element with data-hs: write its word into its bridge's hidden field, whose changes viser sends.
   // The number behind the word makes every click a change. Of what changes within 50 ms viser sends only the last, of
   // all controls together. So a word waits until nothing has changed for as long, not even by the word before; of two
@@ -134,7 +133,7 @@ if (!window.hemislamSay) {
     if (!sideways(event)) return;
     event.stopPropagation();
     if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest('input,textarea,select')) return;
-    const target = document.querySelector(`body > * .hs-dock [data-hs="step ${event.key === 'ArrowRight' ? 1 : -1}"]:enabled`);
+    const target = document.querySelector(`.hs-dock [data-hs="step ${event.key === 'ArrowRight' ? 1 : -1}"]:enabled`);
     if (target) hemislamTell('transport', target.dataset.hs, event.repeat); // a held key steps as fast as the page can
   });
   // Space plays and pauses. Firefox would also click the focused button again when the key comes up.
@@ -153,7 +152,7 @@ if (!window.hemislamSay) {
     const scene = document.querySelector('canvas[data-engine]').getBoundingClientRect(), box = tip.getBoundingClientRect();
     if (scene.width < box.width + 16 || (box.left >= scene.left && box.right <= scene.right)) return;
     const aside = box.left > scene.left ? scene.right - 8 - box.right : scene.left + 8 - box.left;
-    const dock = document.querySelector('body > * > .hs-dock'), room = (dock ? dock.getBoundingClientRect().top : innerHeight) - 8;
+    const dock = document.querySelector('.hs-dock:not([hidden])'), room = (dock ? dock.getBoundingClientRect().top : innerHeight) - 8;
     tip.style.translate = `${aside}px ${Math.min(box.height / 2 + 18, room - box.bottom)}px`;
   };
   new MutationObserver(() => {
@@ -209,4 +208,3 @@ if (!window.hemislamSay) {
     event.preventDefault();
     take(box, true);
   }, true);
-}
