@@ -257,24 +257,17 @@ class FilesPanel:
             moving = gui.add_checkbox(
                 "with moving points", True, hint="Marked in PLY, PCD, LAS and LAZ; other formats omit them."
             )
-            problem = gui.add_html("")
-            save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
+            add_button(gui, "Save", lambda _: confirmed(), viser.Icon.DEVICE_FLOPPY, color=None)
 
-        def confirmed(_: object) -> None:
+        def confirmed() -> None:
+            now = self._page.snapshot().recording
+            if now is None or now.path != recording.path:
+                raise HemislamError("Another recording is open now; cancel, and save its results instead.")
             formats = (_FORMATS[files.value],) if files.value in _FORMATS else ()
-            try:
-                now = self._page.snapshot().recording
-                if now is None or now.path != recording.path:
-                    raise HemislamError("Another recording is open now; cancel, and save its results instead.")
-                folder = self._results / folder_name(name.value)
-                choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
-            except HemislamError as error:
-                problem.content = panel("text", str(error))
-                return
-            self._page.send(Save(folder, formats, choice))
+            choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
+            self._page.send(Save(self._results / folder_name(name.value), formats, choice))
             close()
 
-        save.on_click(confirmed)
         files.on_update(by_user(lambda chosen, _: setattr(of_a_run, "visible", chosen == _OF_A_RUN)))
 
 
@@ -287,7 +280,7 @@ class FileList:
 
     Args:
         suffixes: of the files that may be chosen. nothing: shown for a folder without such files.
-        choose: called with the file, and then `close`; if `choose` raises a HemislamError, that is shown instead.
+        choose: called with the file, and then `close`; if `choose` raises a HemislamError, the dialog stays.
     """
 
     def __init__(
@@ -348,9 +341,5 @@ class FileList:
             self._rows.append(add_button(self._gui, text, lambda _: act(), icon))
 
     def _chosen(self, path: Path) -> None:
-        try:
-            self._choose(path)
-        except HemislamError as error:
-            self._here.content = panel("path", "", str(error))
-            return
+        self._choose(path)
         self._close()

@@ -19,7 +19,6 @@ import viser
 
 from app.server.fork import engine_number
 from app.server.protocol import LoadParams, Restart, SetParams, Snapshot
-from app.slam.errors import HemislamError
 from app.slam.params import Leaf, Params, leaves
 from app.slam.sections import Effect
 from app.slam.types import GROUND, SEED
@@ -381,18 +380,12 @@ def _load_yaml(client: viser.ClientHandle, page: Page) -> None:
     with dialog(client, "Load parameters") as close:
         client.gui.add_html(panel("text", "Paste YAML or choose a file. Parameters it omits return to their defaults."))
         text = client.gui.add_text("yaml", "", multiline=True)
-        problem = client.gui.add_html("")
         upload = client.gui.add_upload_button("Choose a file", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,text/yaml")
-        apply = client.gui.add_button("Apply", icon=viser.Icon.CHECK)
+        add_button(client.gui, "Apply", lambda _: applied(), viser.Icon.CHECK, color=None)
 
-    def applied(_: Any) -> None:
-        try:
-            Params().merged_yaml(text.value)
-        except HemislamError as error:
-            problem.content = panel("problem", str(error))
-            return
+    def applied() -> None:
+        Params().merged_yaml(text.value)  # refused here, so that the dialog stays
         page.send(LoadParams(text.value))
         close()
 
     upload.on_upload(lambda _: show(text, upload.value.content.decode("utf-8", errors="replace")))
-    apply.on_click(applied)

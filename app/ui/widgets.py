@@ -201,15 +201,14 @@ def ask_text(
     Args:
         label: of the field. text: its initial content. confirm: label of the button that calls `act` with the text.
     """
-    with dialog(client, title) as close:
-        field = client.gui.add_text(label, text)
-        button = client.gui.add_button(confirm, icon=viser.Icon.CHECK)
 
-    def confirmed(_: object, __: viser.ClientHandle) -> None:
+    def confirmed(_: viser.ClientHandle) -> None:
         act(field.value)
         close()
 
-    button.on_click(by_user(confirmed))
+    with dialog(client, title) as close:
+        field = client.gui.add_text(label, text)
+        add_button(client.gui, confirm, confirmed, viser.Icon.CHECK, color=None)
 
 
 def notify_error(client: viser.ClientHandle, error: object) -> None:

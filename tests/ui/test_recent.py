@@ -99,10 +99,9 @@ def test_results_are_not_saved_under_the_name_of_a_recording_that_is_no_longer_o
     files = FilesPanel(page_of(server, sent.append, lambda: now[0]), Folders([tmp_path]), tmp_path)
     browser = Browser(server, monkeypatch)
     files.ask_where(browser)  # type: ignore[arg-type]
-    (save,) = browser.added["Save"]._impl.update_cb
     now[0] = opened(tmp_path / "hall.mcap", 9)  # another page opens it
-    save(None)
-    assert not sent
+    browser.clicks("Save")
+    assert not sent and browser.told == ["Another recording is open now; cancel, and save its results instead."]
     now[0] = opened(tmp_path / "walk.mcap", 20)
-    save(None)
+    browser.clicks("Save")
     assert [type(command) for command in sent] == [Save]
