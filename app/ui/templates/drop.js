@@ -1,14 +1,14 @@
 // Dropped files are copied into the first folder in pieces that fit into a request; then the recording opens.
   const PIECE = 1 << 19;
   const RECORDING = /\.(mcap|bag|db3|pcap|pcapng|hemislam)$/i;
-  let box = null, busy = false;
+  const box = document.querySelector('.hs-drop');
+  let busy = false;
   const show = (html, working) => {
-    box = box || document.body.appendChild(document.createElement('div'));
-    box.className = 'hs hs-drop' + (working ? ' hs-working' : '');
-    box.setAttribute('role', 'status');
+    box.classList.toggle('hs-working', working);
     box.innerHTML = html;
+    box.hidden = false;
   };
-  const hide = () => { box?.remove(); box = null; };
+  const hide = () => { box.hidden = true; };
   const end = (words) => {
     show('<p></p><button class="hs-button">Close</button>', true);
     box.querySelector('p').textContent = words;

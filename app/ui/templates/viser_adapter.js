@@ -61,9 +61,8 @@
     if (tab) sheet.hsSheet = tab.ariaSelected === 'true' && sheet.hsSheet === 'high' ? 'low' : 'high';
   }, true);
 
-  // The panel is closed by hiding it: viser would take all it holds off the page, and the bar with it.
-  document.body.insertAdjacentHTML('beforeend', '<button class="hs-button hs-reopen" title="Show the panel.">« Panel</button>');
-  const reopen = document.body.lastElementChild, chevron = '[data-dock-region-collapse]';
+  // The panel is closed by hiding it: viser would take all it holds off the page, and what the bar shows with it.
+  const reopen = document.querySelector('.hs-reopen'), chevron = '[data-dock-region-collapse]';
   const close = (event, closed) => { event?.stopImmediatePropagation(); sheet.hsPanel = closed ? 'closed' : 'open'; };
   reopen.onclick = () => close(null, false);
   for (const kind of ['pointerdown', 'mousedown', 'click', 'keydown']) {
@@ -165,12 +164,8 @@
   let missed = 0;
   setInterval(() => {
     const lost = document.querySelector('[style*="opacity 150ms"][style*="pointer-events: none"]');
-    const words = document.querySelector('.hs-lost');
-    missed = lost ? missed + 1 : 0;
-    if (!lost && words) words.remove();
-    if (missed < 2 || words) return; // not for a moment's break
-    document.body.insertAdjacentHTML('beforeend', `<div class="hs hs-lost" role="alert"><b>The server does not answer.</b>
-      What you see is the last state. This page reconnects automatically as soon as the server is back.</div>`);
+    missed = lost && !document.querySelector('.hs-dock').hidden ? missed + 1 : 0;
+    document.querySelector('.hs-lost').hidden = missed < 2; // not for a moment's break
   }, 500);
 
   // A number box is taken as a whole, on Enter or when it is left; Escape brings the old number back.
