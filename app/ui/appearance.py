@@ -106,14 +106,15 @@ class AppearancePanel:
         self._ends.pop(mode, None)
         show(self._colour_by, mode)
 
-    def choose_ends(self, low: int, high: int) -> None:
-        """Let the colours span a part of all values, given in percent; with 0 to 100 they span all values again."""
+    def choose_ends(self, word: str) -> None:
+        """Let the colours span a part of all values, "ends 0 80" in percent; after "ends 0 100", all values again."""
         all_ = self._limits
-        if (low, high) == (0, 100):
-            self._ends.pop(self._colour_by.value, None)
-        elif all_ is not None:
-            width = (all_.high - all_.low) / 100
-            self._ends[self._colour_by.value] = Limits(all_.low + low * width, all_.low + high * width)
+        match word.split():
+            case ["ends", "0", "100"]:
+                self._ends.pop(self._colour_by.value, None)
+            case ["ends", low, high] if low.isdecimal() and high.isdecimal() and int(low) < int(high) <= 100 and all_:
+                width = (all_.high - all_.low) / 100
+                self._ends[self._colour_by.value] = Limits(all_.low + int(low) * width, all_.low + int(high) * width)
 
     def look_freely(self, client: viser.ClientHandle) -> None:
         """Stop following the sensor, and notify the user if following was on."""

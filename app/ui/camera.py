@@ -164,9 +164,10 @@ class Framing:
         """Leave a browser's camera alone, since it is sent elsewhere; a slow browser may still report its old place."""
         self._left.add(client.client_id)
 
-    def cover(self, client: viser.ClientHandle, percent: int) -> None:
-        """Keep the map above the transport and the diagnostics, which hide the lower edge of a browser's scene."""
-        self._covered[client.client_id] = percent
+    def cover(self, word: str, client: viser.ClientHandle) -> None:
+        """Keep the map above what hides the lower edge of a browser's scene, "cover 12" percent of its height."""
+        if (percent := word.removeprefix("cover ")).isdecimal():
+            self._covered[client.client_id] = int(percent)
 
     def picture(self, client: viser.ClientHandle) -> Picture:
         """The picture in which a browser shows the scene."""

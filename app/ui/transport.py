@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -36,21 +35,11 @@ SPEEDS: Final = {
 
 
 class TransportPanel:
-    """The bar, which `templates/transport.js` draws; the strips of `app.ui.timeline` unfold above it.
+    """The bar, which `templates/transport.js` draws; the strips of `app.ui.timeline` unfold above it."""
 
-    choose_ends: called with the ends of the colour bar chosen by the user, in percent of all values.
-    cover: called with a browser and the percentage of its scene's height that the bar and the strips hide.
-    """
-
-    def __init__(
-        self,
-        page: Page,
-        choose_ends: Callable[[int, int], None] = lambda low, high: None,
-        cover: Callable[[viser.ClientHandle, int], None] = lambda client, percent: None,
-    ) -> None:
+    def __init__(self, page: Page) -> None:
         gui, send = page.gui, page.send
-        self._send, self._snapshot, self._choose_ends = page.send, page.snapshot, choose_ends
-        self._cover = cover
+        self._send, self._snapshot = page.send, page.snapshot
         self._changes = Changes(page.now, PANEL_PERIOD_S)
         self._bridge = Bridge(gui, "transport", self._asked)
         self._state = gui.add_html("")
@@ -72,8 +61,8 @@ class TransportPanel:
         ):
             self._state.content = panel("transport_state", json.dumps(state(snapshot)))
 
-    def _asked(self, word: str, client: viser.ClientHandle) -> None:
-        """Handle what the script sends: "play", "pause", "step -1", "seek 812", "speed 2×", "ends 0 80", "cover 12"."""
+    def _asked(self, word: str, _: viser.ClientHandle) -> None:
+        """Handle what the script sends: "play", "pause", "resume", "step -1", "seek 812", "speed 2×"."""
         match word.split(" ", 1):
             case ["play"]:
                 self.toggle()
@@ -87,12 +76,6 @@ class TransportPanel:
                 self._send(Seek(int(frame)))
             case ["speed", name] if name in SPEEDS:
                 self._send(SetSpeed(SPEEDS[name]))
-            case ["cover", percent] if percent.isdecimal():
-                self._cover(client, int(percent))
-            case ["ends", shares]:
-                low, _, high = shares.partition(" ")
-                if low.isdecimal() and high.isdecimal() and int(low) < int(high) <= 100:
-                    self._choose_ends(int(low), int(high))
 
 
 def state(snapshot: Snapshot) -> dict[str, Any]:

@@ -98,13 +98,12 @@ class Workbench:
         page = Page(server, forks.send, lambda: forks.snapshot, now, lambda: self._scene.offset)
 
         self._header, scale = HeaderPanel(gui), ScaleBars(page)
-        self._transport = TransportPanel(
-            page, lambda low, high: self._appearance.choose_ends(low, high), self._scene.framing.cover
-        )
-        self._timeline = TimelinePanel(page)
+        self._transport, self._timeline = TransportPanel(page), TimelinePanel(page)
+        Bridge(gui, "camera", self._scene.framing.cover)
         legend = gui.add_html("")
         files = FilesPanel(page, folders, results)
         self._recent = RecentPanel(page, folders, results / "sessions", files.browse)
+        Bridge(gui, "legend", lambda word, _: self._appearance.choose_ends(word))
         Bridge(gui, "opened", lambda tab, _: self._opened(tab))
         tabs = gui.add_tab_group()
         with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS_HORIZONTAL):

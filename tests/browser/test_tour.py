@@ -64,7 +64,8 @@ def test_who_may_only_view_is_not_told_what_to_try(bench: Bench, chromium: Brows
 def test_what_is_asked_for_in_the_same_moment_all_arrives(bench: Bench) -> None:
     bench.engine.sent.clear()
     bench.page.evaluate(
-        "for (const word of ['cover 66', 'speed 2×', 'step 1', 'cover 70']) hemislamTell('transport', word)"
+        """[['camera', 'cover 66'], ['transport', 'speed 2×'], ['transport', 'step 1'], ['camera', 'cover 70']].forEach(
+          ([name, word]) => hemislamTell(name, word))"""
     )
     bench.eventually(lambda: StepFrame(1) in bench.engine.sent)
     assert SetSpeed(2.0) in bench.engine.sent

@@ -170,7 +170,7 @@ def test_the_map_stays_in_the_picture_as_it_grows(framed: Framed) -> None:
 
 def test_the_map_stays_above_what_covers_the_scene(framed: Framed) -> None:
     framing, browser, _ = framed
-    framing.cover(browser, 30)  # type: ignore[arg-type]
+    framing.cover("cover 30", browser)  # type: ignore[arg-type]
     settle(framing)
     assert browser.camera.position == pytest.approx(whole(HALL / 4, OBLIQUE, Picture(shape=1.6, covered=0.3)).position)
     stood = browser.camera.position
@@ -253,7 +253,7 @@ def test_each_browser_has_a_lens_of_its_own(server: viser.ViserServer, framed: F
 
 def test_the_floor_of_a_section_is_above_what_covers_the_scene(server: viser.ViserServer, framed: Framed) -> None:
     framing, browser, _ = framed
-    framing.cover(browser, 30)  # type: ignore[arg-type]
+    framing.cover("cover 30", browser)  # type: ignore[arg-type]
     panel = CameraPanel(page_of(server), framing, lambda _: None)
     panel.face(browser, np.array([5.0, 2.0, 4.0]), (3.0, 8.0))  # type: ignore[arg-type]
     stand, picture = Stand(browser.camera.position, browser.camera.look_at), Picture(browser.camera.fov, 1.6, 0.3)

@@ -9,8 +9,10 @@ import viser
 from app.export.box import Box
 from app.server.protocol import SetParams, StepFrame
 from app.slam.types import MOVING
+from app.ui.appearance import AppearancePanel
 from app.ui.chunks import MapChunks
 from app.ui.colours import LABEL_COLOURS, Limits
+from app.ui.scale import Looks
 from app.ui.widgets import View
 from tests.ui.conftest import Wire, clouds
 from tests.ui.drawn import Drawn, chunk_nodes
@@ -203,6 +205,23 @@ def test_colours_spread_over_the_chosen_ends_and_saturate_beyond(drawn: Drawn, s
     red = beyond.max(axis=1, keepdims=True)
     assert len(beyond) > 10 and np.ptp(beyond / red, axis=0).max() < 0.03, "one colour, lit differently"
     assert drawn.scene.chunks.limits.get("height") == all_values, "the bar still ends at all values"
+
+
+@pytest.mark.parametrize(
+    ("word", "ends"),
+    [("ends 10 80", Limits(2.2, 3.6)), ("ends 80 10", None), ("ends 0 101", None), ("ends x 3", None), ("", None)],
+)
+def test_the_ends_of_the_colour_bar_are_shares_of_all_values(
+    server: viser.ViserServer, word: str, ends: Limits | None
+) -> None:
+    panel = AppearancePanel(server.gui, server.gui.add_html(""), Looks(server))
+    panel.choose_ends("ends 10 80")
+    assert panel.view.ends is None, "there are no values yet"
+    panel.draw(View(), Limits(2.0, 4.0), [], 0, 0, 1)
+    panel.choose_ends(word)
+    assert panel.view.ends == ends
+    panel.choose_ends("ends 0 100")
+    assert panel.view.ends is None
 
 
 def test_following_keeps_the_sensor_near_the_origin_and_leaves_the_camera_alone(drawn: Drawn, wire: Wire) -> None:

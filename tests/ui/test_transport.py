@@ -84,18 +84,6 @@ def test_anything_else_that_comes_from_a_page_is_left_alone(transport: Transport
     assert transport.engine.sent == []
 
 
-@pytest.mark.parametrize(
-    ("word", "ends"), [("ends 10 80", (10, 80)), ("ends 80 10", None), ("ends 0 101", None), ("ends x 3", None)]
-)
-def test_the_ends_of_the_colour_bar_are_passed_on(
-    server: viser.ViserServer, word: str, ends: tuple[int, int] | None
-) -> None:
-    chosen: list[tuple[int, int]] = []
-    panel = TransportPanel(page_of(server), lambda *at: chosen.append(at))
-    user_sets(panel._bridge._field, word + " #1")
-    assert chosen == ([ends] if ends else [])
-
-
 @pytest.mark.parametrize("name", SPEEDS)
 def test_speeds_are_sent_and_shown(transport: Transporting, name: str) -> None:
     transport.says(f"speed {name}")

@@ -199,7 +199,7 @@ const settle = () => {
   const put = (name, pixels) => { if (style.getPropertyValue(name) !== pixels + 'px') style.setProperty(name, pixels + 'px'); };
   put('--hs-beside', innerWidth - box.right); put('--hs-bar', high); put('--hs-under', high + (sheet ? sheet.offsetHeight : 0));
   const above = box.bottom + 8 - dock.getBoundingClientRect().top, hidden = Math.round(100 * Math.max(0, above / box.height) || 0);
-  if (hidden !== covered) { covered = hidden; tell('cover ' + hidden); }
+  if (hidden !== covered) { covered = hidden; hemislamTell('camera', 'cover ' + hidden); }
 };
 new ResizeObserver(paint).observe(dock);
 const watch = (name, act) => { // also after viser has made the panel again, as for another server
@@ -224,7 +224,7 @@ const explain = () => {
   copy('.hs-legend')();
   if (focus >= 0 && ends()[focus]) ends()[focus].focus();
 };
-const choose = (at) => tell(`ends ${Math.min(...at)} ${Math.max(...at)}`);
+const choose = (at) => hemislamTell('legend', `ends ${Math.min(...at)} ${Math.max(...at)}`);
 legend.onpointerdown = () => { spread = true; window.addEventListener('pointerup', () => { spread = false; }, {once: true}); };
 legend.onchange = () => { choose(ends().map((end) => Number(end.value))); setTimeout(explain, 600); };
 legend.ondblclick = () => choose([0, 100]);
