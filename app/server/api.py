@@ -11,7 +11,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -41,16 +40,10 @@ MOST_EXPORTS = 4
 
 
 # --- actions -------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class Action:
-    """Makes the command that `{"action": NAME, ...}` in a request's body sends to the engine.
-
-    Attributes:
-        command: makes the command from the fields. fields: in the form that `pydantic.create_model` takes.
-    """
-
-    command: Callable[..., Command]
-    fields: Mapping[str, Any] = field(default_factory=dict)
+Actions = Mapping[str, tuple[Callable[..., Command], Mapping[str, Any]]]
+"""By name: makes the command that `{"action": NAME, ...}` sends to the engine, and the fields of that body, in the form
+that `pydantic.create_model` takes.
+"""
 
 
 def _edit(kind: Callable[..., LoopEdit]) -> Callable[..., Command]:
@@ -60,7 +53,9 @@ def _edit(kind: Callable[..., LoopEdit]) -> Callable[..., Command]:
 Index = Annotated[int, Field(ge=0, le=10**12 - 1)]  # session files hold no larger numbers
 Count = Annotated[int, Field(ge=1)]
 Weight = Annotated[float, Field(gt=0, description="Divides the loop's covariance.")]
-Registered = Annotated[bool, Field(description="Register the two submaps; false: keep their pose in the graph.")]
+Registered = Annotated[
+    bool, Field(alias="register", description="Register the two submaps; false: keep their pose in the graph.")
+]
 Label = Annotated[int, Field(ge=NON_GROUND, le=MOVING)]
 Labels = Annotated[
     Label | tuple[Label, ...],
@@ -68,53 +63,51 @@ Labels = Annotated[
 ]
 PAIR = {"older": (Index, ...), "newer": (Index, ...)}
 
-TRANSPORT = {
-    "play": Action(protocol.Play),
-    "pause": Action(protocol.Pause),
-    "restart": Action(protocol.Restart),
-    "step": Action(protocol.StepFrame, {"frames": (Count, 1)}),
-    "seek": Action(protocol.Seek, {"frame": (Index, ...)}),
-    "speed": Action(protocol.SetSpeed, {"factor": (Speed, ...)}),
+TRANSPORT: Actions = {
+    "play": (protocol.Play, {}),
+    "pause": (protocol.Pause, {}),
+    "restart": (protocol.Restart, {}),
+    "step": (protocol.StepFrame, {"frames": (Count, 1)}),
+    "seek": (protocol.Seek, {"frame": (Index, ...)}),
+    "speed": (protocol.SetSpeed, {"factor": (Speed, ...)}),
 }
-LABELS = {
-    "set": Action(protocol.EditLabels, {"keyframe": (Index, ...), "labels": (Labels, ...)}),
-    "undo": Action(protocol.UndoLabels),
+LABELS: Actions = {
+    "set": (protocol.EditLabels, {"keyframe": (Index, ...), "labels": (Labels, ...)}),
+    "undo": (protocol.UndoLabels, {}),
 }
-LOOPS = {
-    "accept": Action(_edit(Accept), PAIR),
-    "reject": Action(_edit(Reject), PAIR),
-    "weigh": Action(_edit(SetWeight), PAIR | {"weight": (Weight, 1.0)}),
-    "add": Action(_edit(Add), PAIR | {"register": (Registered, True)}),
-    "solve": Action(_edit(Solve)),
-    "undo": Action(protocol.UndoLoop),
-    "redo": Action(protocol.RedoLoop),
+LOOPS: Actions = {
+    "accept": (_edit(Accept), PAIR),
+    "reject": (_edit(Reject), PAIR),
+    "weigh": (_edit(SetWeight), PAIR | {"weight": (Weight, 1.0)}),
+    "add": (_edit(Add), PAIR | {"register_": (Registered, True)}),
+    "solve": (_edit(Solve), {}),
+    "undo": (protocol.UndoLoop, {}),
+    "redo": (protocol.RedoLoop, {}),
 }
 
 
 class _Body(BaseModel):
-    """The body of a request. A `_` at the end of a field's name is removed: pydantic itself uses `register`."""
+    """The body of a request."""
 
-    model_config = ConfigDict(extra="forbid", alias_generator=lambda name: name.removesuffix("_"))
+    model_config = ConfigDict(extra="forbid")
 
 
-def _bodies(actions: Mapping[str, Action]) -> Any:
+def _bodies(actions: Actions) -> Any:
     """The type of a request body that names one of the actions."""
-    models = []
-    for name, action in actions.items():
-        fields: dict[str, Any] = {f"{field}_": definition for field, definition in action.fields.items()}
-        fields["action"] = (Literal[name], ...)
-        models.append(create_model(f"{name.title()}Action", __base__=_Body, **fields))
+    models = [
+        create_model(f"{name.title()}Action", __base__=_Body, **dict(fields, action=(Literal[name], ...)))
+        for name, (_, fields) in actions.items()
+    ]
     return Annotated[functools.reduce(operator.or_, models), Field(discriminator="action")]
 
 
-def _add_actions(
-    router: APIRouter, path: str, engine: RunningEngine, actions: Mapping[str, Action], summary: str
-) -> None:
+def _add_actions(router: APIRouter, path: str, engine: RunningEngine, actions: Actions, summary: str) -> None:
     """Add a route that takes the name of an action in the body and sends its command to the engine."""
 
     def post(body: Any) -> None:
         fields = body.model_dump(by_alias=True)
-        _send(engine, actions[fields.pop("action")].command(**fields))
+        command, _ = actions[fields.pop("action")]
+        _send(engine, command(**fields))
 
     post.__annotations__["body"] = _bodies(actions)
     router.add_api_route(path, post, methods=["POST"], status_code=202, name=path.strip("/"), description=summary)

@@ -27,11 +27,7 @@ const read = () => {
   draw(); mark();
 };
 const beyond = (s, v) => s.limit !== null && (s.low ? v < s.limit : v > s.limit);
-const columnOf = (frame) => {
-  let low = 0, high = d.starts.length;
-  while (high - low > 1) { const mid = (low + high) >> 1; if (d.starts[mid] <= frame) low = mid; else high = mid; }
-  return low;
-};
+const columnOf = (frame) => d.starts.findLastIndex((start) => start <= frame);
 const say = (text, x, y, colour, align = 'left') => {
   pen.fillStyle = colour; pen.textAlign = align; pen.fillText(text, x, y);
 };
