@@ -63,9 +63,9 @@ def within_budget(chunks: tuple[Chunk, ...], poses: F64, sensor: F64, budget: in
     levels = [chunk.level for chunk in kept]
     positions = poses[[chunk.index for chunk in kept], :3, 3]
     while total > budget * _SLACK and (index := next_to_thin(levels, positions, sensor)) is not None:
-        before, kept[index] = kept[index], coarser(kept[index])
-        total -= len(before.points) - len(kept[index].points)
         levels[index] += 1
+        before, kept[index] = kept[index], at_level(kept[index], levels[index])
+        total -= len(before.points) - len(kept[index].points)
     return tuple(kept)
 
 
@@ -85,7 +85,7 @@ def _spread(chunks: tuple[Chunk, ...], poses: F64) -> tuple[Chunk, ...]:
         place = 1 + int(np.argmin(where[2:] - where[:-2]))
         index, after = shown.pop(place), shown[place]
         kept[index], kept[after] = (
-            _chosen(kept[index], np.empty(0, np.int64), EMPTY_LEVEL),
+            at_level(kept[index], EMPTY_LEVEL),
             _joined(kept[index], kept[after], poses),
         )
     return tuple(kept)
@@ -100,25 +100,19 @@ def _joined(chunk: Chunk, after: Chunk, poses: F64) -> Chunk:
     joined = replace(after, **both)
     order = np.random.default_rng(after.index).permutation(len(joined.points))
     joined = _chosen(joined, order, after.level)
-    return _at_level(joined, after.level) if after.level else joined
+    return at_level(joined, after.level) if after.level else joined
 
 
 def as_thin(chunk: Chunk, held: Chunk | None) -> Chunk:
     """A chunk at the level of the one it replaces, so that a changed label does not cost other keyframes points."""
-    while held is not None and chunk.level < held.level:
-        chunk = coarser(chunk) if chunk.level < COARSEST_LEVEL else _chosen(chunk, np.empty(0, np.int64), EMPTY_LEVEL)
-    return chunk
+    return at_level(chunk, held.level) if held is not None and chunk.level < held.level else chunk
 
 
-def coarser(chunk: Chunk) -> Chunk:
-    """A chunk at the next level."""
-    return _at_level(chunk, chunk.level + 1)
-
-
-def _at_level(chunk: Chunk, level: int) -> Chunk:
-    """The chunk with one point per voxel of a level >= 1."""
-    chosen = np.sort(_first_per_voxel(chunk.points, voxel_of_level(level)))  # keeps the random order
-    return _chosen(chunk, chosen, level)
+def at_level(chunk: Chunk, level: int) -> Chunk:
+    """The chunk at a level >= 1: the same points, whichever lower levels it had before."""
+    if level == EMPTY_LEVEL:
+        return _chosen(chunk, np.empty(0, np.int64), level)
+    return _chosen(chunk, np.sort(_first_per_voxel(chunk.points, voxel_of_level(level))), level)  # in random order
 
 
 def _chosen(chunk: Chunk, chosen: I64, level: int) -> Chunk:

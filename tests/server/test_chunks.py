@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.server import chunks as chunks_module
-from app.server.chunks import COARSEST_LEVEL, MOST_SHOWN, coarser, next_to_thin, voxel_of_level, within_budget
+from app.server.chunks import COARSEST_LEVEL, MOST_SHOWN, at_level, next_to_thin, voxel_of_level, within_budget
 from app.server.fold import Fold
 from app.server.protocol import Chunk, Transport
 from app.server.publisher import CHUNKS_AT_ONCE, Publisher
@@ -49,8 +49,9 @@ def walk(keyframes: int) -> np.ndarray:
 def test_a_level_leaves_one_point_with_all_that_belongs_to_it_in_every_occupied_voxel(seed: int, levels: int) -> None:
     full = thin = chunk(seed, 400)
     for _ in range(levels):
-        thin = coarser(thin)
+        thin = at_level(thin, thin.level + 1)
     assert thin.level == levels
+    assert np.array_equal(at_level(full, levels).intensity, thin.intensity), "at once as step by step"
     size = np.float32(1 / voxel_of_level(levels))
     cells = [tuple(cell) for cell in np.floor(thin.points * size).astype(int)]
     # levels nest: voxels of one are eight of the one before, so what is left of these fills all of those
