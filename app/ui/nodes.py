@@ -88,12 +88,10 @@ def segments(positions: F64 | F32) -> F32:
 
 
 class TrajectoryNode:
-    """The estimated path, in blocks of at most `BLOCK` segments below the node `root`."""
+    """A path, in blocks of at most `BLOCK` segments below the node `root`."""
 
-    def __init__(self, scene: viser.SceneApi, root: str, colour: Rgb = PATH_COLOUR) -> None:
-        self._scene = scene
-        self._root = root
-        self._colour = colour
+    def __init__(self, scene: viser.SceneApi, root: str, colour: Rgb = PATH_COLOUR, width: float = 3.0) -> None:
+        self._scene, self._root, self._colour, self._width = scene, root, colour, width
         self._blocks: list[viser.LineSegmentsHandle] = []
 
     def draw(self, positions: F64, visible: bool) -> None:
@@ -103,30 +101,23 @@ class TrajectoryNode:
         for index, first in enumerate(range(0, len(positions) - 1, BLOCK)):
             part = segments(positions[first : first + BLOCK + 1])
             if index == len(self._blocks):
-                self._blocks.append(add_lines(self._scene, f"{self._root}/{index}", part, self._colour, 3.0))
+                self._blocks.append(add_lines(self._scene, f"{self._root}/{index}", part, self._colour, self._width))
             elif len(part) != len(drawn := self._blocks[index].points) or np.abs(part - drawn).max() > STILL_M:
                 self._blocks[index].points = part
             self._blocks[index].visible = visible
 
 
 class Truth:
-    """The true path, sent once in the truth's own frame; the pose of its node places it in the map."""
+    """The true path in the truth's own frame. Only the pose of the frame changes as the trajectory grows."""
 
     def __init__(self, scene: viser.SceneApi, root: str) -> None:
-        self._scene = scene
-        self._root = root
-        self._lines: list[viser.LineSegmentsHandle] = []  # one or none
-        self._loaded: F64 | None = None
+        self._frame = scene.add_frame(root, show_axes=False, visible=False)
+        self._path = TrajectoryNode(scene, f"{root}/path", TRUTH_COLOUR, 1.5)
 
     def draw(self, positions: F64 | None, T_map_truth: F64 | None, visible: bool) -> None:
         """Show (m, 3) positions transformed by `T_map_truth` (4, 4); hidden while that is unknown."""
-        if positions is not self._loaded:
-            self._loaded = positions
-            clear(self._lines)
-            if positions is not None and len(positions) >= 2:
-                some = positions[:: max(1, len(positions) // _MOST_TRUTH_POINTS)]
-                self._lines = [add_lines(self._scene, self._root, segments(some), TRUTH_COLOUR, 1.5, visible=False)]
-        for line in self._lines:
-            line.visible = visible and T_map_truth is not None
-            if T_map_truth is not None:
-                place(line, T_map_truth)
+        known = np.empty((0, 3)) if positions is None else positions
+        self._path.draw(known[:: max(1, len(known) // _MOST_TRUTH_POINTS)], True)
+        self._frame.visible = visible and T_map_truth is not None
+        if T_map_truth is not None:
+            place(self._frame, T_map_truth)
