@@ -16,6 +16,7 @@ viser has no events for HTML and no way to run a script, and it has keys of its 
   another Paper, with the cursor of a pointer, and its icon is chevron-down while it is closed.
 * While the server is not connected, panels are dimmed with a transition of 150 ms and take no clicks.
 * The scene is inset by the width of the docked panel, whose chevron carries `data-dock-region-collapse`.
+* The hint of a button is in the properties of a React component around it, whose type is that of its message.
 * Dock tabs carry `data-dock-tab`; the tab that is shown has `aria-selected`. The two buttons beside the title have the
   icons list-search and adjustments. The box of a slider follows its track, with Mantine's class names.
 """

@@ -238,6 +238,16 @@ def test_a_tooltip_covers_no_control(bench: Bench) -> None:
     expect(tip).to_have_count(0)
 
 
+def test_a_button_says_on_hover_what_it_does(bench: Bench) -> None:
+    """viser itself shows no hints of buttons."""
+    bench.page.get_by_role("tab", name="A/B").click()
+    fork = bench.page.get_by_role("button", name="Fork here")
+    expect(fork).to_have_attribute("title", "Continue from this frame with other parameters, side by side.")
+    bench.workbench._compare._fork.hint = "It is another one now."
+    expect(fork).to_have_attribute("title", "It is another one now.")
+    bench.page.get_by_role("tab", name="Parameters").click()
+
+
 def test_a_recording_is_chosen_from_the_allowed_folder(bench: Bench) -> None:
     bench.page.get_by_role("tab", name="Recording").click()
     bench.page.get_by_role("button", name="Open a recording").click()

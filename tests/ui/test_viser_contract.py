@@ -83,6 +83,10 @@ ASSUMPTIONS = {
         "components/Button.tsx",
         'import { Button } from "@mantine/core";',
     ),
+    "A button's component no longer gets its whole message: its hint is not shown.": (
+        "ControlPanel/Generated.tsx",
+        "return <ButtonComponent {...conf} />;",
+    ),
     "Panels are no longer dimmed while the server is lost: nothing says so in words.": (
         "ControlPanel/Generated.tsx",
         'pointerEvents: connected ? undefined : "none",\n        transition: "opacity 150ms ease",',

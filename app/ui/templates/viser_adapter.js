@@ -86,6 +86,15 @@ new MutationObserver((changes) => {
   for (const {target: tab} of changes) if (tab.role === 'tab' && tab.ariaSelected === 'true') hemislamTell('opened', tab.textContent.trim());
 }).observe(document.body, {subtree: true, attributeFilter: ['aria-selected']});
 
+// viser shows the hints of all controls but buttons. React keeps a button's message at its element.
+const hintOf = (button) => {
+  const kept = (kind) => button[Object.keys(button).find((key) => key.startsWith(kind))];
+  let part = kept('__reactFiber');
+  if (part?.memoizedProps !== kept('__reactProps')) part = part?.alternate; // the other one is of before
+  while (part && !/^Gui(Upload)?ButtonMessage$/.test(part.memoizedProps?.type)) part = part.return;
+  return part?.memoizedProps.props.hint || '';
+};
+
 // viser's own buttons beside the title have icons only.
 const named = {'list-search': 'All commands (Ctrl K)', 'adjustments': 'Connection and scene, as viser has them'};
 setInterval(() => {
@@ -94,6 +103,7 @@ setInterval(() => {
       button.title = name; button.setAttribute('aria-label', name);
     }
   }
+  for (const button of document.querySelectorAll('.mantine-Button-root')) button.title = hintOf(button);
   // viser's folders open by the mouse only; here Tab reaches their heads, and Enter opens and closes them.
   for (const head of document.querySelectorAll('.mantine-Paper-root[data-with-border]>.mantine-Paper-root')) {
     if (head.style.cursor !== 'pointer') continue;
