@@ -19,7 +19,6 @@ from app.slam.text_files import shortened
 from app.slam.trajectory import truth_beside
 from app.ui.html import panel
 from app.ui.nodes import clear
-from app.ui.viser_adapter import Bridge
 from app.ui.widgets import Changes, Page, add_button, by_user, dialog, limited
 
 _MOST_ENTRIES: Final = 60
@@ -74,7 +73,7 @@ def folder_name(typed: str) -> str:
 
 
 class RecentPanel:
-    """Ways to continue: the last session and, while none is open, recent recordings; also restarts an ended engine.
+    """Buttons: the last session and, while no recording is open, recent ones; also one that restarts an ended engine.
 
     Args:
         kept: folder of the session files. browse: asks for a recording.
@@ -84,11 +83,9 @@ class RecentPanel:
         self._send, self._folders, self._kept = page.send, folders, kept
         self._sessions: list[tuple[Path, SavedSession]] = []
         self._changes = Changes()
-        self._bridge = Bridge(page.gui, "last", self._open_last)
         self._restart = add_button(
             page.gui, "Start the engine again", lambda _: page.send(Restart()), viser.Icon.REFRESH, visible=False
         )
-        self._last = page.gui.add_html("")  # shown as long as the recording is open, so that nothing below moves
         self._browse = add_button(
             page.gui, "Open a recording…", browse, viser.Icon.FOLDER_OPEN, color=None, visible=False
         )
@@ -111,30 +108,23 @@ class RecentPanel:
                 for path, saved in found
                 if (present is None or path.resolve() != present.resolve()) and own in (None, saved.opened.recording)
             ]
-        before = self._sessions
-        here = recording is not None and before and snapshot.live is None
-        self._last.content = self._bridge.live(panel("last_session", session_text(before[0][1]))) if here else ""
         self._offers = []
-        if nothing and before:
-            self._buttons[0].hint = session_text(before[0][1])
-            recent = dict.fromkeys(saved.opened.recording for _, saved in before)
-            self._offers = [("Restore last session", before[0][0])]
+        if self._sessions and (nothing or (recording is not None and snapshot.live is None)):
+            # Offered as long as the recording is open, so that nothing below moves.
+            self._buttons[0].hint = f"Open it again: {session_text(self._sessions[0][1])}."
+            self._offers = [("Restore last session", self._sessions[0][0])]
+        if nothing:
+            recent = dict.fromkeys(saved.opened.recording for _, saved in self._sessions)
             self._offers += [(f"Open {path.name}", path) for path in list(recent)[:_RECENT]]
         for button, offer in itertools.zip_longest(self._buttons, self._offers):
             button.visible = offer is not None
             if offer is not None:
                 button.label = offer[0]
 
-    def _open_last(self, _word: str, _client: viser.ClientHandle) -> None:
-        if self._sessions:
-            self._open(self._sessions[0][0])
-
     def _pick(self, number: int, _: viser.ClientHandle) -> None:
         if number < len(self._offers):
-            self._open(self._offers[number][1])
-
-    def _open(self, path: Path) -> None:
-        self._send(OpenRecording(path, truth_beside(path)))
+            path = self._offers[number][1]
+            self._send(OpenRecording(path, truth_beside(path)))
 
 
 def session_text(saved: SavedSession) -> str:

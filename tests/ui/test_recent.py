@@ -18,7 +18,7 @@ from app.slam.errors import HemislamError
 from app.slam.loops.edits import Reject
 from app.slam.params import Params
 from app.ui.files import FilesPanel, RecentPanel
-from tests.ui.conftest import Browser, page_of, user_clicks, user_sets
+from tests.ui.conftest import Browser, page_of, user_clicks
 
 STATE = State(Params(), edits=(Reject(3, 9), Reject(4, 9)), notes=(Note(4, "a door"),))
 
@@ -50,14 +50,14 @@ def test_the_last_session_of_the_recording_is_offered_as_long_as_that_is_open(
     start = opened(kept.parent / "open/walk.mcap", 0)
     for frame in (0, 99):
         panel.draw(replace(start, transport=Transport(frame=frame)))
-        assert "Open it again: walk.mcap, frame 41, 2 loop edits, 1 note." in panel._last.content
-    assert not any(button.visible for button in panel._buttons), "they would move the tabs"
-    user_sets(panel._bridge._field, "restore #1")
+        assert panel._buttons[0].hint == "Open it again: walk.mcap, frame 41, 2 loop edits, 1 note."
+    assert [button.visible for button in panel._buttons] == [True, False, False, False], "they would move the tabs"
+    user_clicks(panel._buttons[0])
     assert sent == [OpenRecording(kept / "1.hemislam", None)]
     panel.draw(replace(start, session=2, session_file=kept / "1.hemislam"))
-    assert "frame 12" in panel._last.content, "not the one that is open"
+    assert "frame 12" in str(panel._buttons[0].hint), "not the one that is open"
     panel.draw(replace(start, session=3, recording=OpenedRecording(kept / "new.mcap", 0, 10.0, 100, ())))
-    assert not panel._last.content
+    assert not panel._buttons[0].visible
 
 
 def test_without_a_recording_those_of_before_are_offered_too(server: viser.ViserServer, kept: Path) -> None:
