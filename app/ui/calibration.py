@@ -16,7 +16,7 @@ from app.sensors.presets import calibrated_beside, sidecar
 from app.sensors.recording import NO_GRAVITY, NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
-from app.slam.errors import HemislamError
+from app.slam.errors import HemislamError, refusal
 from app.slam.params import Params
 from app.ui.background import Background
 from app.ui.html import panel
@@ -27,7 +27,7 @@ _EXPLAINED = (
     "line, from the recording alone. Takes about as long as the recording."
 )
 _APPLIES = "Use these parameters, save them beside the recording, and read the recording again."
-_UNDOES = "Restore the earlier parameters and the file beside the recording, and read the recording again."
+_UNDOES = "Restore the earlier parameters and the files beside the recording, and read the recording again."
 _KEEPS = "Save these parameters beside the recording, so that they apply whenever it is opened. Undo reverts this."
 
 
@@ -66,7 +66,7 @@ class CalibrationPanel:
         self._plot = gui.add_html("")
         self._found = FoundMounting([], {})
         self._before: dict[str, Any] = {}  # values that the result replaced; empty while it is not applied
-        self._file: bytes | None = None  # the parameter file beside the recording, before it was written
+        self._files: dict[Path, bytes | None] = {}  # parameter files beside the recording, before they were written
         self._sentence = ""  # for the report, once the values are applied
         self._given = Params()
         self._of: Path | None = None
@@ -179,12 +179,13 @@ class CalibrationPanel:
         self._tell()
         if kept and self._of is not None:
             try:
-                if self._file is None:
-                    sidecar(self._of).unlink(missing_ok=True)
-                else:
-                    sidecar(self._of).write_bytes(self._file)
+                for path, content in self._files.items():
+                    if content is None:
+                        path.unlink(missing_ok=True)
+                    else:
+                        path.write_bytes(content)
             except OSError as error:
-                self._tell(("kept", f"{sidecar(self._of)} cannot be put back ({error.strerror}); delete it"))
+                self._tell(("kept", f"{refusal(error)} {calibrated_beside(self._of)}".strip()))
 
     def _write(self) -> None:
         """Save the result beside the recording."""
@@ -192,7 +193,8 @@ class CalibrationPanel:
         path = sidecar(self._of)
         self._keep.visible = False
         try:
-            self._file = path.read_bytes() if path.is_file() else None
+            both = path, path.with_name(f"{path.name}.old")
+            self._files = {one: one.read_bytes() if one.is_file() else None for one in both}
             write_beside(self._of, self._found.values)
             self._tell(("kept", f"in {path}; applied whenever this recording is opened"))
         except (HemislamError, OSError) as error:

@@ -138,7 +138,24 @@ def test_undoing_brings_a_file_back_that_somebody_wrote(page: Calibrating) -> No
     sensor = with_preset(WALK).sensor
     assert (sensor.rotation, sensor.max_range) == ((70.0, -50.0, 104.0), 40)
     user_clicks(page.panel._apply)
-    assert sidecar(WALK).read_text() == mine
+    assert sidecar(WALK).read_text() == mine and not Path("walk.params.yaml.old").exists()
+
+
+def test_what_cannot_be_put_back_is_said_with_the_file_that_holds_it(
+    page: Calibrating, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sidecar(WALK).write_text("sensor:\n  max_range: 40\n")
+    page.found(FoundMounting([], FOUND))
+    user_clicks(page.panel._apply)
+
+    def full(path: Path, _: bytes) -> int:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    user_clicks(page.panel._apply)
+    shown = page.panel._html.content
+    assert "No space left" in shown and "rename walk.params.yaml.old to walk.params.yaml" in shown
+    assert Path("walk.params.yaml.old").exists()
 
 
 def test_a_full_disk_loses_no_file_that_somebody_wrote(page: Calibrating, monkeypatch: pytest.MonkeyPatch) -> None:
