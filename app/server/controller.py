@@ -12,14 +12,7 @@ from typing import Any
 from app.mapping.breakpoints import Breakpoints
 from app.mapping.kept import NOTHING_KEPT, Kept
 from app.mapping.session import EFFECT, Session
-from app.mapping.session_file import (
-    SUFFIX,
-    SavedSession,
-    SessionWriter,
-    State,
-    new_path,
-    read_session,
-)
+from app.mapping.session_file import SUFFIX, SavedSession, SessionWriter, State, new_path, read_session
 from app.server import protocol
 from app.server.georeferencing import Georeferencing
 from app.server.keeping import KeptCommand, changed
@@ -144,8 +137,8 @@ class Controller:
                 self._need_session().calibration = text
                 if text:
                     self._page.notice("warning", text)
-            case protocol.Restart():
-                self._open_soon(self._need_session().feed.info.path, self._reopen)
+            case protocol.Restart(stay):
+                self._open_soon(self._need_session().feed.info.path, lambda: self._reopen(stay))
             case protocol.Save(folder, formats, choice):
                 session = self._need_session()
                 saved = session.saved(self._state(session))
@@ -313,9 +306,10 @@ class Controller:
         self._player.halt()
         self._take(session)
 
-    def _reopen(self) -> None:
+    def _reopen(self, stay: bool) -> None:
         """Restart with the present parameters. User data stays; loop edits stay only if the keyframes are the same."""
         before, kept = self._need_session(), self._kept
+        aim = self._player.aim(before) if stay else 0
         self._of_before = 0
         info, edits = before.feed.info, before.edits
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
@@ -326,6 +320,8 @@ class Controller:
             session.edit_loops(edits.done, edits.undone)
             if any(params.keyframe != self._params.keyframe for _, params in before.history):
                 session.loops.leave_out(0)
+        if stay:
+            self._player.resume(session, aim, to_end=False)
 
     def _resume(self, path: Path) -> None:
         """Open the recording of a session file, and repeat the session up to its frame."""

@@ -115,6 +115,10 @@ class Player:
         """Whether the session stays at its frame."""
         return self._target is None and not self._page.transport.playing and not self.page_behind
 
+    def aim(self, session: Session) -> int:
+        """The frame that the session goes to, or where it is; one after the last frame: the end."""
+        return self._target.frame if self._target is not None else session.frame + session.ended
+
     def play(self) -> None:
         self._pacer.release()
         self._page.show(playing=True)

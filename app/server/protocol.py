@@ -110,7 +110,12 @@ class Calibrated(Command, frozen=True):
 
 
 class Restart(Command, frozen=True):
-    """Restart the present recording with the present parameters; loop edits and notes stay."""
+    """Restart the present recording with the present parameters; loop edits and notes stay.
+
+    stay: return to the frame that was shown, or that the session was going to.
+    """
+
+    stay: bool = False
 
 
 class Save(Command, frozen=True):

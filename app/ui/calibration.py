@@ -14,7 +14,7 @@ from app.calibration.words import table, write_beside
 from app.child import Link
 from app.sensors.presets import calibrated_beside, sidecar
 from app.sensors.recording import NO_GRAVITY, NO_IMU
-from app.server.protocol import LIVE, Calibrated, Restart, Seek, SetParams, Snapshot
+from app.server.protocol import LIVE, Calibrated, Restart, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError, refusal
 from app.slam.params import Params
@@ -203,12 +203,9 @@ class CalibrationPanel:
 
     def _set(self, values: dict[str, Any], sentence: str) -> None:
         """Set parameters, restart with them, and return to the frame that was shown."""
-        transport = self._page.snapshot().transport
         self._page.send(SetParams(values))
-        self._page.send(Restart())
+        self._page.send(Restart(stay=True))
         self._page.send(Calibrated(sentence))
-        if transport.frame > 0:
-            self._page.send(Seek(transport.frame + transport.finished))
         self._offer()
 
     def _offer(self) -> None:

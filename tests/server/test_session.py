@@ -234,6 +234,25 @@ def test_a_restart_parameter_waits_for_the_restart() -> None:
     assert snapshot.pending_restart == () and bench.sessions[-1].engine.params.map.voxel_size == 2.5
 
 
+@pytest.mark.parametrize("frame", [0, 30, 59])
+def test_a_restart_that_stays_returns_to_the_frame_shown(frame: int) -> None:
+    bench = Bench()
+    shown = bench.do(Seek(frame)).transport
+    restarted = bench.do(Restart(stay=True))
+    assert len(bench.sessions) == 2 and restarted.session == 2
+    assert (restarted.transport.frame, restarted.transport.finished) == (frame, shown.finished)
+    assert bench.do(Restart()).transport.frame == 0
+
+
+def test_a_restart_that_stays_goes_on_to_the_frame_that_the_session_was_going_to() -> None:
+    bench = Bench()
+    bench.controller.handle(Seek(50))
+    for _ in range(9):
+        bench.controller.work()
+    assert 0 < bench.see().transport.frame < 50
+    assert bench.do(Restart(stay=True)).transport.frame == 50
+
+
 def test_taking_back_a_restart_parameter_leaves_nothing_pending() -> None:
     bench = Bench()
     default = Params().map.voxel_size

@@ -19,10 +19,8 @@ from app.server.protocol import (
     Notice,
     OpenedRecording,
     Restart,
-    Seek,
     SetParams,
     Snapshot,
-    Transport,
 )
 from app.slam.params import Params
 from app.ui import background
@@ -95,9 +93,9 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert process.closed and not panel._work._bar.visible and panel._apply.visible
     assert "roll 70.00 ± 0.05 &lt;deg&gt;" in panel._html.content and page.sent == []
     user_clicks(panel._apply)
-    assert page.sent == [SetParams(FOUND), Restart(), Calibrated("")] and "<svg/>" in panel._plot.content
+    assert page.sent == [SetParams(FOUND), Restart(stay=True), Calibrated("")] and "<svg/>" in panel._plot.content
     user_clicks(panel._apply)
-    assert page.sent[3:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart(), Calibrated("")]
+    assert page.sent[3:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart(stay=True), Calibrated("")]
 
 
 def test_it_can_be_stopped_and_what_was_applied_before_can_still_be_undone(page: Calibrating) -> None:
@@ -243,7 +241,7 @@ def test_an_unknown_mounting_is_found_and_used_on_opening_and_undone_by_a_click(
     unasked.process().messages.append(TOLD)
     unasked.draw(OPEN)
     told = Calibrated(f"{TOLD.contradiction}; this was found in the recording and is used.")
-    assert unasked.sent == [SetParams(FOUND), Restart(), told] and unasked.panel._apply.label == "Undo"
+    assert unasked.sent == [SetParams(FOUND), Restart(stay=True), told] and unasked.panel._apply.label == "Undo"
     assert "turned by 70°" in unasked.panel._html.content
     assert not sidecar(WALK).exists() and unasked.panel._keep.visible, "nobody asked for a file"
     unasked.draw(replace(OPEN, params=Params().with_values(FOUND)))
@@ -267,16 +265,6 @@ def test_a_given_mounting_is_questioned_only_by_a_run_in_doubt_and_never_replace
     unasked.process().messages.append(TOLD)
     unasked.draw(doubtful)
     assert unasked.sent == [ADVICE] and unasked.panel._apply.visible and unasked.panel._apply.label == "Apply"
-
-
-@pytest.mark.parametrize("finished", [False, True])
-def test_what_is_applied_goes_on_from_the_frame_that_was_shown(page: Calibrating, finished: bool) -> None:
-    page.now = replace(OPEN, transport=Transport(frame=299, finished=finished))
-    user_clicks(page.panel._button)
-    page.process().messages.append(TOLD)
-    page.draw(page.now)
-    user_clicks(page.panel._apply)
-    assert page.sent[-1] == Seek(300 if finished else 299)
 
 
 def test_without_an_imu_there_is_no_mounting_to_look_for(unasked: Calibrating) -> None:
