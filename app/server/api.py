@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from app.export.exports import EXPORTS
 from app.mapping.breakpoints import Breakpoints
+from app.mapping.kept import Note
 from app.mapping.session_file import SUFFIX, Speed
 from app.server import protocol
 from app.server.folders import Folders
@@ -207,12 +208,12 @@ def make_router(engine: RunningEngine, folders: Folders) -> APIRouter:
     @router.put("/notes/{place}", status_code=202)
     def edit_note(place: Index, body: NoteBody) -> None:
         """Replace the text of a note. `place` is its index in the list of notes in the state."""
-        _send(engine, EditNote(place, _note(engine, place), body.text))
+        _send(engine, EditNote(_note(engine, place), body.text))
 
     @router.delete("/notes/{place}", status_code=202)
     def delete_note(place: Index) -> None:
         """Delete a note. `place` is its index in the list of notes in the state."""
-        _send(engine, EditNote(place, _note(engine, place), ""))
+        _send(engine, EditNote(_note(engine, place), ""))
 
     @router.get("/recordings")
     def recordings() -> list[str]:
@@ -269,11 +270,11 @@ def _send(engine: RunningEngine, command: Command) -> None:
     engine.send(command)
 
 
-def _note(engine: RunningEngine, place: int) -> str:
+def _note(engine: RunningEngine, place: int) -> Note:
     notes = engine.snapshot.notes
     if place >= len(notes):
         raise HTTPException(404, f"There are {len(notes)} notes.")
-    return notes[place].text
+    return notes[place]
 
 
 def _exported(engine: RunningEngine, name: str, background: BackgroundTasks) -> FileResponse:

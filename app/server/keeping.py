@@ -25,13 +25,9 @@ class AddNote(KeptCommand, frozen=True):
 
 
 class EditNote(KeptCommand, frozen=True):
-    """Replace the text of a note, given by its index in `Snapshot.notes`; an empty text deletes it.
+    """Replace the text of a note of the session; an empty text deletes it."""
 
-    before: its previous text. If another page has changed the note meanwhile, it stays unchanged.
-    """
-
-    place: int
-    before: str
+    note: Note
     text: str
 
 
@@ -74,7 +70,7 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
     """The kept values after a command given at a frame.
 
     Raises:
-        HemislamError: there are too many notes or measures, another page has changed the edited one, or as `Clip`.
+        HemislamError: there are too many notes or measures, the edited one is not there any more, or as `Clip`.
     """
     notes, measures = kept.notes, kept.measures
     match command:
@@ -82,12 +78,13 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
             if len(notes) >= MOST_NOTES:
                 raise HemislamError(f"A session holds at most {MOST_NOTES:,} notes; this one was not added.")
             return replace(kept, notes=(*notes, Note(max(frame, 0), text.strip())))  # -1 before the first frame
-        case EditNote(place, before, text) if 0 <= place < len(notes) and notes[place].text == before:
-            now = (Note(notes[place].frame, text.strip()),) if text.strip() else ()
+        case EditNote(note, text) if note in notes:
+            place = notes.index(note)
+            now = (Note(note.frame, text.strip()),) if text.strip() else ()
             return replace(kept, notes=(*notes[:place], *now, *notes[place + 1 :]))
         case EditNote(text=text) if text.strip():
             raise HemislamError(
-                f"Another page has changed that note meanwhile; it was not replaced by “{text.strip()}”."
+                f"Another page has changed or deleted that note meanwhile; it was not replaced by “{text.strip()}”."
             )
         case KeepView(view):
             return replace(kept, views=(*kept.views, view)[-MOST_VIEWS:])
@@ -99,7 +96,9 @@ def changed(kept: Kept, command: KeptCommand, frame: int) -> Kept:
             return replace(kept, measures=(*measures, measure))
         case EditMeasure(measure, name):
             if name and measure not in measures:
-                raise HemislamError(f"Another page has changed that measure meanwhile; it was not renamed to “{name}”.")
+                raise HemislamError(
+                    f"Another page has changed or deleted that measure meanwhile; it was not renamed to “{name}”."
+                )
             left = (one for one in measures if name or one != measure)
             return replace(kept, measures=tuple(replace(one, name=name) if one == measure else one for one in left))
         case SetClip(changes):

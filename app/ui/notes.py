@@ -42,7 +42,7 @@ class NotesPanel:
 
     def draw(self, snapshot: Snapshot, view: View) -> None:
         self._draw_pins(snapshot, view)
-        listed = [(_word(place, note), note) for place, note in enumerate(snapshot.notes)][-_SHOWN_NOTES:][::-1]
+        listed = [(_word(note), note) for note in snapshot.notes[-_SHOWN_NOTES:][::-1]]
         self._list.content = self._bridge.live(panel("notes", listed)) if listed else ""
 
     def _note(self) -> None:
@@ -53,23 +53,23 @@ class NotesPanel:
             show(self._text, "")
 
     def _act(self, word: str, client: viser.ClientHandle) -> None:
-        """Handle what the list sends: "go 812", "edit 3 91c5", "delete 3 91c5"; see `_word`."""
+        """Handle what the list sends: "go 812", "edit 91c5", "delete 91c5"; see `_word`."""
         verb, _, what = word.partition(" ")
         if verb == "go" and what.isdecimal():
             self._page.send(Seek(int(what)))
-        for place, note in enumerate(self._page.snapshot().notes):
-            if what == _word(place, note) and verb == "delete":
-                self._page.send(EditNote(place, note.text, ""))
-            elif what == _word(place, note) and verb == "edit":
-                self._ask(place, note.text, client)
+        for note in {note for note in self._page.snapshot().notes if what == _word(note)}:
+            if verb == "delete":
+                self._page.send(EditNote(note, ""))
+            elif verb == "edit":
+                self._ask(note, client)
 
-    def _ask(self, place: int, before: str, client: viser.ClientHandle) -> None:
+    def _ask(self, note: Note, client: viser.ClientHandle) -> None:
         def keep(text: str) -> None:
             if not text.strip():
                 raise HemislamError("The note is empty; write something, or cancel and delete it by ✕ in the list.")
-            self._page.send(EditNote(place, before, text))
+            self._page.send(EditNote(note, text))
 
-        ask_text(client, "Edit note", "note", before, "Keep", keep)
+        ask_text(client, "Edit note", "note", note.text, "Keep", keep)
 
     # --- pins ------------------------------------------------------------------------------------
     def _draw_pins(self, snapshot: Snapshot, view: View) -> None:
@@ -103,9 +103,9 @@ class NotesPanel:
         return frame is not None
 
 
-def _word(place: int, note: Note) -> str:
-    """Index and hash of a note: in an outdated list, another note may have this index."""
-    return f"{place} {hash(note):x}"
+def _word(note: Note) -> str:
+    """Names a note to the server, also in an outdated list."""
+    return f"{hash(note):x}"
 
 
 def pins(notes: tuple[Note, ...], frames: int) -> list[tuple[int, str]]:

@@ -97,14 +97,14 @@ def test_a_double_click_on_delete_deletes_one_note(bench: Bench) -> None:
     bench.page.get_by_role("tab", name="Recording").click()
     button = bench.page.get_by_role("button", name="Delete note").first
     button.click()
-    bench.eventually(lambda: bench.engine.sent == [EditNote(3, "remark 3", "")], 8)
+    bench.eventually(lambda: bench.engine.sent == [EditNote(notes[3], "")], 8)
     bench.engine.publish(notes=notes[:3])
     expect(bench.page.get_by_role("button", name="Delete note")).to_have_count(3)
     button.evaluate("(next) => next.dispatchEvent(new MouseEvent('click', {bubbles: true, detail: 2}))")
     bench.page.wait_for_timeout(500)
     assert len(bench.engine.sent) == 1
     button.click()
-    bench.eventually(lambda: bench.engine.sent[1:] == [EditNote(2, "remark 2", "")])
+    bench.eventually(lambda: bench.engine.sent[1:] == [EditNote(notes[2], "")])
     bench.engine.publish(notes=())
     bench.page.get_by_role("tab", name="Parameters").click()
 

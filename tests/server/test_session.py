@@ -8,7 +8,7 @@ import pytest
 import server_fakes as fakes
 from session_bench import Bench, last_notice
 
-from app.mapping.kept import Measure, Spot
+from app.mapping.kept import Measure, Note, Spot
 from app.mapping.session import Session
 from app.server import player
 from app.server.keeping import AddNote, EditMeasure, EditNote
@@ -138,13 +138,20 @@ def test_playing_a_finished_recording_goes_back_to_its_start_and_loses_nothing()
 def test_a_note_is_changed_and_deleted_unless_another_page_has_changed_it() -> None:
     bench = Bench()
     bench.do(Seek(30), AddNote("here"), AddNote("there"))
-    notes = bench.do(EditNote(0, "here", " at the door "), EditNote(1, "seen before", "x")).notes
+    here, there = bench.see().notes
+    notes = bench.do(EditNote(here, " at the door "), EditNote(here, "x")).notes
     assert [note.text for note in notes] == ["at the door", "there"]
-    assert "Another page has changed that note" in last_notice(bench.see())
+    assert "Another page has changed or deleted that note" in last_notice(bench.see())
     gone = Measure("door", (Spot(0, (0.0, 0.0, 0.0)),))
-    assert "Another page has changed that measure" in last_notice(bench.do(EditMeasure(gone, "gate")))
-    assert [note.text for note in bench.do(EditNote(0, "at the door", "")).notes] == ["there"]
-    assert bench.do(EditNote(5, "there", "")).notes == bench.do(EditNote(-1, "there", "")).notes != ()
+    assert "Another page has changed or deleted that measure" in last_notice(bench.do(EditMeasure(gone, "gate")))
+    assert bench.do(EditNote(notes[0], ""), EditNote(here, "")).notes == (there,)
+    (changed,) = bench.do(EditNote(there, "now the first in the list")).notes
+    assert changed.text == "now the first in the list", "that another page deleted an earlier one does not matter"
+
+
+def test_of_two_equal_notes_one_is_deleted() -> None:
+    (note, _) = Bench().do(AddNote("here"), AddNote("here"), EditNote(Note(0, "here"), ""), AddNote("there")).notes
+    assert note == Note(0, "here")
 
 
 def test_a_restart_keeps_the_notes() -> None:
