@@ -72,7 +72,8 @@ def same_recording(a: Snapshot, b: Snapshot) -> bool:
     """Whether frames of A and B can be compared."""
     if a.recording is None or b.recording is None:
         return False
-    return a.recording.path.resolve() == b.recording.path.resolve() and a.recording.start_ns == b.recording.start_ns
+    ours, theirs = ((one.path.resolve(), one.start_ns, one.start_s) for one in (a.recording, b.recording))
+    return ours == theirs
 
 
 def follow(a: Snapshot, b: Snapshot) -> Seek | None:
@@ -81,7 +82,8 @@ def follow(a: Snapshot, b: Snapshot) -> Seek | None:
     if wanted < 0 or not same_recording(a, b) or (b.transport.finished and here <= wanted):
         return None
     if wanted == here:
-        return Seek(wanted + 1) if a.transport.finished else None
+        end_a, end_b = (one.recording.end_s if one.recording else 0.0 for one in (a, b))
+        return Seek(wanted + 1) if a.transport.finished and end_a == end_b else None
     return Seek(wanted)
 
 
@@ -107,7 +109,7 @@ class Workspace:
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._forks = 0
-        self.forked_at = -1
+        self.forked_at = -1  # B was opened, not forked
 
     # --- A, as the page and scripts use it -------------------------------------------------------
     @property
@@ -168,7 +170,7 @@ class Workspace:
             theirs = session.opened
             if ours is None or (ours.path.resolve(), ours.start_s) != (theirs.recording, theirs.start_s):
                 raise HemislamError(f"{path.name} is of {theirs.recording} from {theirs.start_s:g} s; open that first.")
-            self._begin(path, session, path.stem, folder, 0)
+            self._begin(path, session, path.stem, folder, -1)
             a.engine.send(AddNote(f"Opened {path.name} beside this session. {session.left_out}"))
 
     def kept(self) -> list[Path]:

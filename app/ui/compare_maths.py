@@ -145,7 +145,7 @@ def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
     if b.recording is None:
         return "B is starting …", WARN
     if not same_recording(a, b):
-        return "A has opened another recording; B stays at its frame.", WARN
+        return "A has opened another recording or part of it; B stays at its frame.", WARN
     behind = a.transport.frame - b.transport.frame
     unsaved = {saved.error for saved in b.saved}  # a failed save does not count as B's trouble
     errors = [one.text for one in b.notices if one.level == "error" and one.text not in unsaved]

@@ -110,8 +110,17 @@ def test_at_the_end_of_a_b_goes_to_its_end() -> None:
     assert follow(at(50), ended) == Seek(50)
 
 
-def test_another_recording_is_nothing_to_follow() -> None:
+def test_a_b_that_goes_on_after_the_end_of_a_stays_there() -> None:
+    """A was opened on the first ten seconds only."""
+    b = at(99, frames=300)
+    assert follow(replace(at(99), transport=Transport(frame=99, finished=True)), b) is None
+
+
+def test_another_recording_or_part_of_it_is_nothing_to_follow() -> None:
     assert follow(at(50, name="other"), at(3)) is None
+    a = at(50)
+    assert a.recording is not None
+    assert follow(replace(a, recording=replace(a.recording, start_s=5.0)), at(3)) is None
 
 
 def test_a_command_that_a_dying_b_lost_is_sent_again(tmp_path: Path) -> None:
@@ -154,7 +163,7 @@ def test_a_session_is_opened_beside_one_whose_file_cannot_be_written(tmp_path: P
     a = Recorder(at(5, name=str(tmp_path / "walk")))
     workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: Recorder(at(5)))
     workspace.open(tmp_path / "older.hemislam")
-    assert workspace.names == ("main", "older")
+    assert workspace.names == ("main", "older") and workspace.forked_at == -1
     workspace.close()
 
 

@@ -180,7 +180,7 @@ def test_a_fork_is_asked_for_and_what_is_set_next_is_set_in_it(page: Page) -> No
     user_clicks(page.panel._fork)
     page.both_at(20)
     assert page.panel._what.visible and not page.panel._fork.visible and page.sides._choice.value == "B"
-    assert "B · wide &lt;b&gt;" in page.panel._status.content and "forked at 20" in page.panel._status.content
+    assert "B · wide &lt;b&gt;" in page.panel._status.content and "forked at frame 20" in page.panel._status.content
     user_sets(page.workbench._parameters._widgets["ground.alpha"][0].handle, 33.0)
     assert page.b.sent[-1] == SetParams({"ground.alpha": 33.0})
     assert not any(isinstance(command, SetParams) for command in page.engine.sent)
@@ -305,6 +305,14 @@ def test_keep_says_where_the_file_is_and_errors_are_shown(page: Page, tmp_path: 
     assert "no fork" in chooses(page.panel._what, "discard").told[0]
     user_sets(page.workbench._parameters._widgets["ground.alpha"][0].handle, 31.0)
     assert page.engine.sent[-1] == SetParams({"ground.alpha": 31.0}), "without a fork all is A's"
+
+
+def test_what_is_opened_as_b_is_not_called_a_fork(page: Page, tmp_path: Path) -> None:
+    page.forks.fork("wide")
+    page.both_at(20)
+    page.forks.open(page.forks.keep())
+    page.both_at(20)
+    assert "opened beside A" in page.panel._status.content and "forked" not in page.panel._status.content
 
 
 def test_a_fork_made_elsewhere_is_kept_under_its_own_name_not_that_of_the_last(page: Page, tmp_path: Path) -> None:
