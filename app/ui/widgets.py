@@ -117,6 +117,8 @@ Callback = Callable[[viser.GuiEvent[Any]], Coroutine[Any, Any, None]]
 _THREADS: Final = ThreadPoolExecutor(32, "page")
 """Threads that run callbacks, as many as viser has. Some wait minutes for pictures."""
 _NumberBox = TypeVar("_NumberBox", bound=viser.GuiNumberHandle[Any] | viser.GuiVector3Handle)
+_RANGE: Final[Any] = {"min": {"pad": 0.1, "soft": 0.0, "mode": 3}, "max": {"pad": 0.1, "soft": 0.01, "mode": 1}}
+"""Of a chart's values: uPlot's default, but up to 0.01 at least, since ticks have at most three decimals."""
 _PLAIN: Final = (str, int, float, Enum, frozenset, View, Limits)
 
 
@@ -292,6 +294,7 @@ def chart(gui: viser.GuiApi, lines: list[dict[str, Any]], height: int = 110) -> 
     axes: Any = tuple({"font": "10px sans-serif", "ticks": {"size": 3}, "gap": 2, "size": size} for size in (22, 38))
     series: Any = ({"label": "x"}, *({"points": {"show": False}} | line for line in lines))
     return gui.add_uplot(
-        (np.zeros(1),) * len(series), series, axes=axes, scales={"x": {"time": False}}, legend={"show": False},
+        (np.zeros(1),) * len(series), series, axes=axes, legend={"show": False},
+        scales={"x": {"time": False}, "y": {"range": _RANGE}},
         cursor={"show": False}, height=height, padding=(6, 10, 0, 0),
     )  # fmt: skip

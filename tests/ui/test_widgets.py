@@ -15,7 +15,7 @@ import viser
 
 from app.slam.errors import HemislamError
 from app.ui.viser_adapter import Bridge
-from app.ui.widgets import add_command, by_user, limited
+from app.ui.widgets import add_command, by_user, chart, limited
 from tests.ui.conftest import BusyThreads, Wire, browser_sends
 
 APP = Path(__file__).parents[2] / "app"
@@ -87,6 +87,12 @@ def test_what_the_system_refuses_is_shown_as_a_sentence(server: viser.ViserServe
     with ThreadPoolExecutor(1) as thread:  # in that of a test of a browser a loop runs already
         thread.submit(asyncio.run, by_user(act)(event)).result()
     assert len(told) == 1 and told[0].startswith("The system refused: File name too long (nnn")
+
+
+def test_a_chart_of_tiny_values_is_not_magnified_beyond_what_its_ticks_can_say(server: viser.ViserServer) -> None:
+    """Ticks have at most three decimals: those of a smaller range would all read 0."""
+    drawn: Any = chart(server.gui, [{}])
+    assert drawn.scales["y"]["range"]["max"] == {"pad": 0.1, "soft": 0.01, "mode": 1}
 
 
 def test_each_word_of_the_page_is_heard_once_however_late_the_threads_are(
