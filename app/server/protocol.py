@@ -261,11 +261,12 @@ class Saved:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """A message to the user. number: increases by one with every notice."""
+    """A message to the user. number: increases by one with every notice. recording: name of the one open then."""
 
     number: int
     level: Literal["info", "warning", "error"]
     text: str
+    recording: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,6 +68,7 @@ class Publisher:
         self._noticed: dict[str, int] = {}
         self._saved: tuple[Saved, ...] = ()
         self._notices: list[Notice] = []
+        self._recording = ""
         self._frames: Log[Frame] = Log()
         self._clouds: Keyframes = ()
         # State of the reader:
@@ -84,7 +85,7 @@ class Publisher:
 
     def notice(self, level: Literal["info", "warning", "error"], text: str) -> None:
         self._notices_given += 1
-        self._notices.append(Notice(self._notices_given, level, text))
+        self._notices.append(Notice(self._notices_given, level, text, self._recording))
         self.urgent = True
 
     def notice_once(self, text: str, stamp_ns: int | None = None) -> None:
@@ -147,6 +148,7 @@ class Publisher:
         """Show another session, from its first frame or from the frame at which an earlier process left it."""
         self.begin(session.frames, session.keyframes)
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
+        self._recording = session.feed.info.path.name
         self.put(recording=opened_recording(session))
         self.show(frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.dropped)
         if session.frame < 0:

@@ -103,9 +103,13 @@ def verdicts(findings: tuple[Finding, ...]) -> tuple[str, str] | None:
     return ", ".join(parts), BAD if needing else WARN if counts["corrected"] else GOOD
 
 
-def log_html(notices: tuple[Notice, ...]) -> str:
-    """The newest notices, newest first."""
-    return panel("log", [(notice.text, _LEVELS[notice.level][1]) for notice in reversed(notices[-_LOG_LINES:])])
+def log_html(notices: tuple[Notice, ...], recording: str = "") -> str:
+    """The newest notices, newest first; those that came while another recording was open name it."""
+    lines = [
+        (one.text if one.recording in ("", recording) else f"{one.recording}: {one.text}", _LEVELS[one.level][1])
+        for one in reversed(notices[-_LOG_LINES:])
+    ]
+    return panel("log", lines)
 
 
 class DoctorPanel:
@@ -145,14 +149,16 @@ class NoticePanel:
         self._server = server
         self._log = server.gui.add_html("")
         self._shown: set[int] = set()
+        self._changes = Changes()
 
     def draw(self, snapshot: Snapshot) -> None:
         """Notify every browser of new notices since the previous call."""
-        new = [notice for notice in snapshot.notices if notice.number not in self._shown]
-        if not new:
+        recording = snapshot.recording.path.name if snapshot.recording else ""
+        if not snapshot.notices or not self._changes(snapshot.notices, recording):
             return
+        new = [notice for notice in snapshot.notices if notice.number not in self._shown]
         self._shown |= {notice.number for notice in new}
-        self._log.content = heading("Messages") + log_html(snapshot.notices)
+        self._log.content = heading("Messages") + log_html(snapshot.notices, recording)
         for client in self._server.get_clients().values():
             for notice in new:
                 title, _, colour, seconds = _LEVELS[notice.level]

@@ -13,11 +13,7 @@ import viser
 from viser._messages import GuiUpdateMessage
 
 from app.server.folders import Folders
-from app.server.protocol import (
-    Progress,
-    SetParams,
-    StepFrame,
-)
+from app.server.protocol import Notice, OpenRecording, Progress, SetParams, StepFrame
 from app.ui.readouts import HISTORY
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, clouds, user_sets
@@ -188,3 +184,13 @@ def test_the_thread_outlives_a_snapshot_that_can_not_be_drawn(page: Page, caplog
     page.workbench.close()
     assert "Still here" in page.workbench._transport._state.content
     assert "could not be drawn" in caplog.text
+
+
+def test_messages_of_an_earlier_recording_name_it(page: Page) -> None:
+    page.engine.publish(notices=(Notice(1, "warning", "It drifts.", "hall_bpearl.mcap"),))
+    page.draw()
+    log = page.workbench._notices._log
+    assert "It drifts." in log.content and "hall_bpearl" not in log.content
+    page.engine.send(OpenRecording(Path("/data/other.mcap")))
+    page.draw()
+    assert "hall_bpearl.mcap: It drifts." in log.content
