@@ -45,6 +45,7 @@ class PicturesPanel:
         self._flying = threading.Lock()  # held by the thread of the button that began the flight
         self._stopped = threading.Event()
         self._share, self._saved = 0.0, Path()
+        self._problem = ""  # why the newest flight ended early; a browser that was reloaded missed the notification
         self._changes = Changes()
         self._width = limited(gui.add_number("width (px)", 1920, min=64, max=_LARGEST, step=1))
         self._height = limited(gui.add_number("height (px)", 1080, min=64, max=_LARGEST, step=1))
@@ -64,12 +65,13 @@ class PicturesPanel:
     def draw(self, snapshot: Snapshot) -> None:
         flying = self._flying.locked()
         self._start.disabled = flying or len(snapshot.trajectory) < 2
-        if self._changes(flying, int(100 * self._share), str(self._saved)):
+        if self._changes(flying, int(100 * self._share), str(self._saved), self._problem):
             self._progress.visible = self._stop.visible = flying
             show(self._progress, 100 * self._share)
             done = not flying and self._saved.is_file()
             self._download.visible = done
-            self._where.content = panel("path", "Saved as ", str(self._saved)) if done else ""
+            problem = panel("text", self._problem) if self._problem else ""
+            self._where.content = problem + (panel("path", "Saved as ", str(self._saved)) if done else "")
 
     def close(self) -> None:
         """Stop flying."""
@@ -117,6 +119,8 @@ class PicturesPanel:
                 "The browser sent no picture in time; keep this tab in front, or choose a smaller size."
             ) from None
         except RuntimeError:
+            if client.client_id not in self._page.server.get_clients():
+                raise HemislamError("The browser tab that rendered was closed or reloaded; start again.") from None
             raise HemislamError("The browser could not render this; choose a smaller size.") from None
 
     def _name(self) -> str:
@@ -132,9 +136,12 @@ class PicturesPanel:
             stations = flight(path, round(_RATE * self._seconds.value), *_WAYS[self._way.value])
             file = self._results / "flights" / f"{self._name()}.zip"
             file.parent.mkdir(parents=True, exist_ok=True)
-            self._share = 0.0
+            self._share, self._problem = 0.0, ""
             self._stopped.clear()
             self._take(client, stations, file)
+        except HemislamError as error:
+            self._problem = str(error)
+            raise
         finally:
             self._flying.release()
 

@@ -187,6 +187,19 @@ def test_a_flight_ends_where_another_recording_is_opened_and_that_is_said(bench:
     assert len(bench.browser.asked) == 1 and "the flight has ended" in bench.browser.told[0]
 
 
+def test_a_flight_ends_with_its_browser_and_the_page_says_so_after_a_reload(
+    bench: Bench, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.browser.problem = RuntimeError("the client disconnected before returning a frame")
+    monkeypatch.setattr(server, "get_clients", lambda: {1: Browser()})
+    bench.do(bench.panel._fly)
+    assert "closed or reloaded" in bench.panel._where.content
+    bench.browser.problem = None
+    bench.panel._seconds.value = 1.0
+    bench.do(bench.panel._fly)
+    assert "reloaded" not in bench.panel._where.content and bench.panel._download.visible
+
+
 @pytest.mark.parametrize(
     ("problem", "words"),
     [
