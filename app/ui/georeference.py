@@ -20,7 +20,7 @@ from app.ui.files import FileList
 from app.ui.georeference_maths import centre_of_sphere, lines_of, names_of, numbers_in, rows_of
 from app.ui.html import panel
 from app.ui.loops.words import describe_edit
-from app.ui.measure import POINT, MeasurePanel
+from app.ui.measure import POINT, STOP, MeasurePanel
 from app.ui.nodes import add_exact_points, add_lines, clear
 from app.ui.viser_adapter import Bridge
 from app.ui.widgets import ROOT, Changes, Page, add_button, by_user, dialog, limited, show
@@ -159,6 +159,8 @@ class GeoreferencePanel:
         self._radius.visible = bool(names) and self._fit.value == _SPHERE
         if names and self._name.options != names:
             self._name.options = names
+        if not names and self._measure.taker == self._picked:
+            self._measure.begin(STOP)  # there is no point to pick any more, for example in another recording
 
     # --- picking ---------------------------------------------------------------------------------
     def _picked(self, spots: tuple[Spot, ...], current: Snapshot) -> None:

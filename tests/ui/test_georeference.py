@@ -219,6 +219,21 @@ def sphere(centre: np.ndarray, radius: float, points: int = 400) -> Chunk:
     return chunk_of(1, np.concatenate([centre + radius * ways + random.normal(size=ways.shape) * 0.002, floor]))
 
 
+@pytest.mark.parametrize("away", [True, False])
+def test_picking_ends_with_the_control_points_and_takes_no_click_of_another_recording(
+    paging: Paging, away: bool
+) -> None:
+    here = replace(paging.now, recording=OpenedRecording(Path("a.mcap"), 0, 9.0, 90, ()))
+    paging.show(replace(here, earth=Earth(Survey(control=TABLE))))
+    user_clicks(paging.panel._pick)
+    assert paging.measure.picking
+    if away:
+        paging.show(replace(paging.now, recording=OpenedRecording(Path("b.mcap"), 0, 9.0, 90, ()), earth=Earth()))
+    else:
+        choose(paging.panel._by, NOTHING)
+    assert not paging.measure.picking
+
+
 def test_a_click_on_a_sphere_finds_its_centre_to_millimetres() -> None:
     centre, radius = np.array([1.0, 0.5, 0.25]), 0.1
     toward = (SEEN_AT[:3, 3] - centre) / np.linalg.norm(SEEN_AT[:3, 3] - centre)
