@@ -129,8 +129,9 @@ class AddLoopPanel:
         show(self._newer, pair[1])
 
     def done(self) -> None:
-        """Remove the clouds and the gizmo after a decision."""
+        """Remove the clouds, the gizmo and the dots after a decision, or for another session."""
         show(self._nudge, False)
+        self._picked = None
 
     def suggest(self) -> None:
         self._tried = True
@@ -204,12 +205,13 @@ class AddLoopPanel:
         self._picked = [] if self._picked is None else None
 
     def _draw_picking(self, snapshot: Snapshot) -> None:
-        picked = self._picked
+        positions = snapshot.keyframe_poses[:, :3, 3]
+        if (picked := self._picked) is not None:
+            picked[:] = [index for index in picked if index < len(positions)]  # the session may have gone back
         self._pick.label = _PICK if picked is None else (_SECOND if picked else _FIRST)
         if not self._changes(snapshot.keyframe_poses, -1 if picked is None else len(picked)):
             return
         clear(self._dots)
-        positions = snapshot.keyframe_poses[:, :3, 3]
         if picked is None or not len(positions):
             return
         colours = np.tile(np.array(_DOT, np.uint8), (len(positions), 1))

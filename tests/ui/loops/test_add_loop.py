@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from app.server.protocol import InspectLoop, TryLoop
 from app.slam import lie
 from app.slam.loops.edits import Add
+from app.ui.loops.add_loop import _FIRST, _SECOND
 from tests.ui.conftest import user_clicks
 from tests.ui.fake_loops import KEYFRAMES
 from tests.ui.loops.conftest import GOOD, Page
@@ -25,6 +26,26 @@ def test_two_keyframes_are_picked_in_the_scene_and_connected_from_where_the_grap
     user_clicks(added._try)
     page.draw()
     assert page.engine.sent == [TryLoop(Add(61, 140))]
+
+
+def test_a_picked_keyframe_that_is_gone_after_going_back_is_picked_anew(page: Page) -> None:
+    added, poses = page.loops._add_loop, page.engine.snapshot.keyframe_poses
+    user_clicks(added._pick)
+    page.click_scene(poses[140, :3, 3] + [0.4, -0.3, 6.0], poses[140, :3, 3])
+    page.draw()
+    assert added._pick.label == _SECOND
+    page.engine.publish(keyframe_poses=poses[:100])
+    page.draw()
+    assert added.picking and added._pick.label == _FIRST and len(page.node("/map/add_loop/keyframes").points) == 100
+
+
+def test_picking_ends_with_the_session(page: Page) -> None:
+    added, poses = page.loops._add_loop, page.engine.snapshot.keyframe_poses
+    user_clicks(added._pick)
+    page.click_scene(poses[61, :3, 3] + [0.4, -0.3, 6.0], poses[61, :3, 3])
+    page.engine.publish(session=page.engine.snapshot.session + 1)
+    page.draw()
+    assert not added.picking and page.node("/map/add_loop/keyframes") is None
 
 
 def test_a_pair_that_makes_no_sense_is_not_sent(page: Page) -> None:
