@@ -226,6 +226,7 @@ class ParameterPanel:
         self._bridge = Bridge(gui, "sliders", lambda *_: setattr(self, "_released", True))
         self._opened = params
         self._recording: Path | None = None
+        self._session = -1  # whose scan lines limit the slider of M
         gui.add_html(heading("Ground segmentation"))
         for path in PRIMARY:
             self._add(self._sections["primary"][path.partition(".")[2]])
@@ -257,6 +258,10 @@ class ParameterPanel:
         """Update the controls from a snapshot. tuning: whether the user is moving ground sliders."""
         now = self._now()
         source = engine_number(snapshot), snapshot.recording.path if snapshot.recording else None
+        if snapshot.result is not None and snapshot.session != self._session:
+            self._session, slider = snapshot.session, self._widgets["ground.scan_lines"][0].handle
+            lines = int(snapshot.result.cloud.ring.max(initial=0)) + 1
+            slider.max = lines if lines >= slider.value else slider.max
         if source != self._source:  # these edits were for another engine or recording
             self._source, self._history = source, self._histories[source]
             self._edits.clear()
@@ -303,12 +308,6 @@ class ParameterPanel:
             self._history.go(by)
             self._edits.clear()
             self._send(SetParams(values))
-
-    def fit_lines(self, lines: int) -> None:
-        """Limit the slider of M to the number of scan lines of the open recording."""
-        slider = self._widgets["ground.scan_lines"][0].handle
-        if lines >= slider.value:
-            slider.max = lines
 
     def _add(self, leaf: Leaf) -> None:
         path = leaf.path

@@ -241,8 +241,6 @@ class Workbench:
             self._tuned = look
         view = replace(view, tuning=look == self._tuned)
         if self._scene_due(current, view, self._more, self._scene.framing.pictures, self._scene.eyes, at_once=tuned):
-            if current.result is not None and (drawn is None or drawn.result is None):
-                self._parameters.fit_lines(int(current.result.cloud.ring.max(initial=0)) + 1)
             self._more += not self._scene.draw(current, view)
             self._drawn = current
         lines = self._lines(current, view)

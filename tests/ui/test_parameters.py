@@ -268,11 +268,6 @@ def test_changes_that_wait_for_a_restart_are_named_beside_a_restart_button(param
     assert parameters.sent == [Restart()]
 
 
-def test_the_slider_of_m_ends_at_the_sensor_s_number_of_lines(parameters: Parameters) -> None:
-    parameters.panel.fit_lines(32)
-    assert parameters.control("ground.scan_lines").max == 32
-
-
 def test_a_value_set_in_a_browser_is_sent_although_an_older_snapshot_is_drawn_meanwhile(
     parameters: Parameters, server: viser.ViserServer, busy: BusyThreads
 ) -> None:

@@ -194,3 +194,15 @@ def test_messages_of_an_earlier_recording_name_it(page: Page) -> None:
     page.engine.send(OpenRecording(Path("/data/other.mcap")))
     page.draw()
     assert "hall_bpearl.mcap: It drifts." in log.content
+
+
+def test_the_slider_of_m_reaches_all_scan_lines_of_the_recording_that_is_opened_next(page: Page) -> None:
+    """The page may never draw a snapshot of it without a frame."""
+    page.engine.send(StepFrame())
+    result = page.engine.snapshot.result
+    assert result is not None
+    for session, lines in ((7, 16), (8, 128)):
+        cloud = replace(result.cloud, ring=np.full(len(result.cloud), lines - 1, np.uint16))
+        page.engine.publish(session=session, result=replace(result, cloud=cloud))
+        page.draw(1.0)
+        assert page.workbench._parameters._widgets["ground.scan_lines"][0].handle.max == lines
