@@ -150,7 +150,10 @@ class Publisher:
         self.result, self._corrections, self._noticed = None, MapFrame(), {}
         self._recording = session.feed.info.path.name
         self.put(recording=opened_recording(session))
-        self.show(frame=session.frame, stamp_ns=0, finished=False, frames_per_second=0.0, dropped=session.dropped)
+        stamp_ns = session.frames[session.frame].stamp_ns if session.frame >= 0 else 0
+        self.show(
+            frame=session.frame, stamp_ns=stamp_ns, finished=False, frames_per_second=0.0, dropped=session.dropped
+        )
         if session.frame < 0:
             for finding in session.findings:
                 if finding.verdict == "needs you":

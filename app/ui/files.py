@@ -164,7 +164,7 @@ class FilesPanel:
         self._download = add_button(gui, "Download…", self._offer, viser.Icon.DOWNLOAD, visible=False)
 
     def draw(self, snapshot: Snapshot) -> None:
-        self._save.disabled = snapshot.result is None
+        self._save.disabled = snapshot.transport.frame < 0
         self._compare.disabled = snapshot.recording is None or snapshot.live is not None
         folder = last_saved(snapshot)
         self._download.visible = folder is not None

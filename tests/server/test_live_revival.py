@@ -6,6 +6,7 @@ Tests app/sensors/live/address.py, app/sensors/live/receiver.py.
 import random
 import secrets
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Listener
@@ -26,7 +27,7 @@ from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.server.controller import Controller
 from app.server.fold import Fold
-from app.server.protocol import LIVE, Snapshot
+from app.server.protocol import LIVE, Pause, Save, Snapshot
 from app.server.publisher import Publisher
 from app.server.setup import Seen
 from app.slam.params import Params
@@ -157,6 +158,27 @@ def test_however_often_engines_die_every_scan_is_mapped_once_or_counted_as_dropp
     for name in ("stamp_s", "dropped", "used", "distance"):
         np.testing.assert_allclose(page.series[name], undisturbed.series[name], err_msg=name)
     assert [chunk.index for chunk in page.chunks] == list(range(len(undisturbed.chunks)))
+
+
+def test_a_paused_map_that_a_new_engine_took_over_has_its_time_and_can_be_saved(
+    params: Params, tmp_path: Path, events: list[Event]
+) -> None:
+    with given(events, tmp_path) as address:
+        bench = Bench(address, params, tmp_path)
+        while bench.session is None or bench.session.frame < 12:
+            bench.controller.work()
+        bench.tell()
+        bench.kill(asking=False)
+        bench.begin()
+        for command in (Pause(), Save(tmp_path / "saved", ("tum",))):
+            bench.controller.handle(command)
+        deadline = time.monotonic() + 60.0
+        while not bench.page.saved and time.monotonic() < deadline:
+            bench.controller.work()
+            bench.tell()
+    (saved,), shown = bench.page.saved, bench.page.transport
+    assert shown.frame >= 0 and not shown.playing and shown.stamp_ns == bench.session.log.stamps_ns[shown.frame]
+    assert saved.error == "" and len((tmp_path / "saved" / "trajectory.tum").read_text().splitlines()) > shown.frame
 
 
 def test_scans_that_are_too_many_to_be_had_again_are_counted_as_dropped(

@@ -14,6 +14,7 @@ from viser._messages import GuiUpdateMessage
 
 from app.server.folders import Folders
 from app.server.protocol import Notice, OpenRecording, Progress, SetParams, StepFrame
+from app.ui.files import FilesPanel
 from app.ui.readouts import HISTORY
 from app.ui.workbench import Workbench
 from tests.ui.conftest import Clock, Wire, clouds, user_sets
@@ -206,3 +207,13 @@ def test_the_slider_of_m_reaches_all_scan_lines_of_the_recording_that_is_opened_
         page.engine.publish(session=session, result=replace(result, cloud=cloud))
         page.draw(1.0)
         assert page.workbench._parameters._widgets["ground.scan_lines"][0].handle.max == lines
+
+
+def test_a_map_whose_newest_frame_cannot_be_shown_can_be_saved(page: Page) -> None:
+    """As after a new engine took over a live map at rest."""
+    (files,) = (panel for panel in page.workbench._panels if isinstance(panel, FilesPanel))
+    assert files._save.disabled
+    page.engine.send(StepFrame(3))
+    page.engine.publish(result=None)
+    page.draw()
+    assert not files._save.disabled
