@@ -11,6 +11,7 @@ from app.mapping.feed import Feed, FeedInfo, Quiet
 from app.mapping.loops import RestartingLoops
 from app.mapping.session import Session
 from app.sensors.live.address import LiveAddress
+from app.sensors.live.intake import BUSY
 from app.sensors.live.process import LiveClient
 from app.sensors.live.status import LiveState
 from app.slam.engine import Engine
@@ -44,6 +45,8 @@ class LiveFeed(Feed):
         event = self._client.poll(POLL_S)
         if isinstance(event, Measurement) and not self._info.start_ns:
             self._info = replace(self._info, start_ns=event.scan.stamp_ns)
+        if isinstance(event, DroppedScan) and event.reason == BUSY and not self._info.start_ns:
+            return Quiet()  # this map did not miss it: nothing was mapped then
         return event if isinstance(event, Measurement | DroppedScan) else Quiet(event)
 
     def place(self) -> tuple[int, int]:

@@ -103,7 +103,7 @@ class LivePanel:
     def __init__(self, page: Page) -> None:
         self._page = page
         self._html = page.gui.add_html("")
-        hint = "Start a new map from the data that the sensor sends from now on. The file of --record has no gap."
+        hint = "Start a new map with the last scans that wait, ten seconds at most. The file of --record has no gap."
         self._back = add_button(
             page.gui,
             "Back to the live source",

@@ -20,6 +20,7 @@ from app.mapping.live import open_live_session
 from app.mapping.session import Session
 from app.sensors.live import receiver
 from app.sensors.live.address import LiveAddress
+from app.sensors.live.intake import BUSY
 from app.sensors.live.receiver import ScanServer
 from app.sensors.live.source import Event
 from app.sensors.live.status import LiveState
@@ -34,7 +35,6 @@ from app.slam.params import Params
 from app.slam.types import DroppedScan, Measurement
 
 LENGTH_S = 4.0
-BUSY = "too many scans waited"
 
 
 class Script:
@@ -158,6 +158,19 @@ def test_however_often_engines_die_every_scan_is_mapped_once_or_counted_as_dropp
     for name in ("stamp_s", "dropped", "used", "distance"):
         np.testing.assert_allclose(page.series[name], undisturbed.series[name], err_msg=name)
     assert [chunk.index for chunk in page.chunks] == list(range(len(undisturbed.chunks)))
+
+
+def test_scans_dropped_before_the_first_one_of_a_map_do_not_count_as_its_own(
+    params: Params, tmp_path: Path, events: list[Event]
+) -> None:
+    """As after returning to the live source from a recording."""
+    waited = [DroppedScan(k, BUSY) for k in range(9)]
+    with given([*waited, DroppedScan(9, "no IMU"), *events], tmp_path) as address:
+        bench = Bench(address, params, tmp_path)
+        while bench.session is None or bench.session.frame < 0:
+            bench.controller.work()
+        bench.tell()
+    assert bench.session.log.dropped == {"no IMU": 1} and bench.page.transport.dropped == 1
 
 
 def test_a_paused_map_that_a_new_engine_took_over_has_its_time_and_can_be_saved(
