@@ -5,7 +5,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from app.mapping.breakpoints import Breakpoints, CheckedFrame, reasons
 from app.mapping.feed import Quiet
@@ -28,8 +27,8 @@ LONG_SEEK = 20
 ONLY_ON = "A live source cannot go back; record it, then open the recording."
 FIRST_DOUBT = 100
 """A run is first checked for doubts after this many frames, then each time this number has doubled, and at the end."""
-_WARNINGS = ("disconnected", "silent", "jump", "recording", "units", "restarted")
-"""Kinds of `Status` that are warnings, not just information."""
+_WARNINGS = ("disconnected", "silent", "recording", "units", "restarted")
+"""Kinds of `Status` that are warnings, as is a jump of a clock, and not just information."""
 
 
 class Pacer:
@@ -239,9 +238,11 @@ class Player:
             self._doubt(session)
             return None
         if isinstance(entry, Quiet):
-            if entry.status is not None:
-                level: Literal["warning", "info"] = "warning" if entry.status.kind in _WARNINGS else "info"
-                self._page.notice(level, f"Live: {entry.status.text}.")
+            status = entry.status
+            if status is not None and status.kind == "jump":  # two senders on one port cause hundreds
+                self._page.notice_once(f"Live: {status.text}.", status.at_ns)
+            elif status is not None:
+                self._page.notice("warning" if status.kind in _WARNINGS else "info", f"Live: {status.text}.")
             return 0.0
         if isinstance(entry, DroppedScan):
             if not revisited:

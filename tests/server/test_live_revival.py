@@ -23,7 +23,7 @@ from app.sensors.live.address import LiveAddress
 from app.sensors.live.intake import BUSY
 from app.sensors.live.receiver import ScanServer
 from app.sensors.live.source import Event
-from app.sensors.live.status import LiveState
+from app.sensors.live.status import LiveState, Status
 from app.sensors.presets import resolve_params
 from app.sensors.recording import open_recording
 from app.server.controller import Controller
@@ -171,6 +171,22 @@ def test_scans_dropped_before_the_first_one_of_a_map_do_not_count_as_its_own(
             bench.controller.work()
         bench.tell()
     assert bench.session.log.dropped == {"no IMU": 1} and bench.page.transport.dropped == 1
+
+
+def test_a_clock_that_jumps_all_the_time_does_not_bury_the_page_in_messages(
+    params: Params, tmp_path: Path, events: list[Event]
+) -> None:
+    """As with two senders on one port."""
+    jumps = [
+        Status("jump", "IMU", f"the IMU's clock was set by {53.3 * (-1) ** k:+.3f} s; its time continues", 10**7 * k)
+        for k in range(2000)
+    ]
+    with given([*jumps, *events], tmp_path) as address:
+        bench = Bench(address, params, tmp_path)
+        while bench.session is None or bench.session.frame < 0:
+            bench.controller.work()
+        bench.tell()
+    assert sum("clock was set" in notice.text for notice in bench.page.notices) == 4, "twice in 20 s, each way"
 
 
 def test_a_paused_map_that_a_new_engine_took_over_has_its_time_and_can_be_saved(
