@@ -250,11 +250,11 @@ class FilesPanel:
             add_button(gui, "Save", lambda _: confirmed(), viser.Icon.DEVICE_FLOPPY, color=None)
 
         def confirmed() -> None:
-            now = self._page.snapshot().recording
-            if now is None or now.path != recording.path:
+            now = self._page.snapshot()
+            if now.recording is None or now.recording.path != recording.path:
                 raise HemislamError("Another recording is open now; cancel, and save its results instead.")
             formats = (_FORMATS[files.value],) if files.value in _FORMATS else ()
-            choice = Choice(thin.value, clip.box if boxed.value else None, clip.slab, moving.value)
+            choice = Choice(thin.value, now.clip.box if boxed.value else None, now.clip.slab, moving.value)
             self._page.send(Save(self._results / folder_name(name.value), formats, choice))
             close()
 

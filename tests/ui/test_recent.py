@@ -7,10 +7,12 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import viser
 
-from app.mapping.kept import Note
+from app.export.box import Box
+from app.mapping.kept import Clip, Note
 from app.mapping.session_file import Opened, SavedSession, State, write_session
 from app.server.folders import Folders
 from app.server.protocol import Command, OpenedRecording, OpenRecording, Restart, Save, Saved, Snapshot, Transport
@@ -105,3 +107,17 @@ def test_results_are_not_saved_under_the_name_of_a_recording_that_is_no_longer_o
     now[0] = opened(tmp_path / "walk.mcap", 20)
     browser.clicks("Save")
     assert [type(command) for command in sent] == [Save]
+
+
+def test_results_are_limited_to_the_clip_box_that_the_page_shows_now(
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    before, after = (Clip(Box.around(np.zeros(3), np.full(3, size)), on=True, slab=size) for size in (1.0, 2.0))
+    now, sent = [replace(opened(tmp_path / "walk.mcap", 9), clip=before)], list[Command]()
+    files = FilesPanel(page_of(server, sent.append, lambda: now[0]), Folders([tmp_path]), tmp_path)
+    browser = Browser(server, monkeypatch)
+    files.ask_where(browser)  # type: ignore[arg-type]
+    now[0] = replace(now[0], clip=after)  # another page moves the box
+    browser.added["Save"]._impl.update_cb[0](None)
+    (save,) = sent
+    assert isinstance(save, Save) and (save.choice.box, save.choice.slab) == (after.box, after.slab)
