@@ -37,15 +37,14 @@ class MeasurePanel:
     """Widgets in the caller's container, and the measures in the scene, below the map's node.
 
     Attributes:
-        spots: clicked so far, of the unfinished measure. taker: the panel that gets them in place of a measure.
+        spots: clicked so far, of the unfinished measure.
     """
 
     def __init__(self, page: Page) -> None:
         gui = page.gui
         self._page = page
         self._changes = Changes()
-        self._kind = STOP
-        self.taker: Taker | None = None
+        self._tool: tuple[str, Taker | None] = STOP, None  # both at once: pages change them while clicks are taken
         self._where: GeoReference | None = None
         self._click: tuple[F64, F64, float] | None = None  # newest click: its ray in the map, and its angular radius
         self.spots: tuple[Spot, ...] = ()
@@ -70,12 +69,17 @@ class MeasurePanel:
     @property
     def picking(self) -> bool:
         """Whether this panel takes clicks in the scene."""
-        return self._kind != STOP
+        return self._tool[0] != STOP
+
+    @property
+    def taker(self) -> Taker | None:
+        """The panel that gets the spots in place of a measure."""
+        return self._tool[1]
 
     def begin(self, kind: str, taker: Taker | None = None) -> None:
         """Take clicks for measures of this kind. taker: gets the spots of the first one, which then is the last."""
         load()
-        self._kind, self.taker, self.spots = kind, taker, ()
+        self._tool, self.spots = (kind, taker), ()
 
     def draw(self, current: Snapshot, view: View) -> None:
         """Handle the newest click, and show the session's measures."""
@@ -84,20 +88,21 @@ class MeasurePanel:
         if current.session != self._session or places(Measure("", self.spots), poses, frames) is None:
             self._session, self.spots = current.session, ()  # the spots lie on what is not in the map now
         click, self._click = self._click, None
-        tool = self._kind, self.taker
-        if click is not None and self.picking and view.map:
+        kind, taker = tool = self._tool
+        if click is not None and kind != STOP and view.map:
             spot = meet(current.chunks, poses, *click, ceilings=view.ceilings, moving=view.moving, clip=view.clip)
             if spot is not None and self._snap.value:
                 spot = snapped(current.chunks, poses, spot)
-            if spot is not None and tool == (self._kind, self.taker):  # meanwhile the user may have chosen another
-                self._take(self._kind, spot, current)
-        begun = self.spots if self.taker is None else ()
+            if spot is not None and tool == self._tool:  # meanwhile the user may have chosen another
+                self._take(tool, spot, current)
+                kind, taker = self._tool
+        begun = self.spots if taker is None else ()
         kept = [(measure, places(measure, poses, frames)) for measure in current.measures]
         where = [(measure, at) for measure, at in kept if at is not None]
         drawn = str([at.round(3).tolist() for _, at in where])
         self._where = current.earth.found.reference if current.earth.found is not None else None
         later = len(kept) - len(where)
-        due = current.measures, self._kind, self.taker, str(begun), drawn, later, current.session, self._where
+        due = current.measures, kind, taker, str(begun), drawn, later, current.session, self._where
         if self._changes(*due, view.light, view.map):
             self._light = view.light
             map_ = current.chunks, current.keyframe_poses
@@ -110,12 +115,13 @@ class MeasurePanel:
             self._draw_scene(places(Measure("", begun), poses, frames) if begun else None)
             self._draw_list(later, view.map)
 
-    def _take(self, kind: str, spot: Spot, current: Snapshot) -> None:
+    def _take(self, tool: tuple[str, Taker | None], spot: Spot, current: Snapshot) -> None:
+        kind, taker = tool
         self.spots = (*self.spots, spot)
         if len(self.spots) < _SPOTS[kind]:
             return
         spots, self.spots = self.spots, ()
-        if (taker := self.taker) is not None:
+        if taker is not None:
             self.begin(STOP)
             taker(spots, current)
             return
@@ -143,15 +149,16 @@ class MeasurePanel:
 
     def _draw_list(self, later: int, map_shown: bool) -> None:
         """later: number of measures on keyframes that do not exist now, for example after going back."""
-        own = self._kind if self.taker is None else STOP
+        kind, taker = self._tool
+        own = kind if taker is None else STOP
         left = _SPOTS[own] - len(self.spots) if own != STOP else 0
         self._kinds.options = (
             *(_CHOSEN + kind if kind == own else kind for kind in _SPOTS),
-            *([STOP] if self.picking else []),
+            *([STOP] if kind != STOP else []),
         )
         points = f"{left}{' more' if self.spots else ''} point{'s' if left > 1 else ''}"
-        asked = f"{self._kind.capitalize()}: click {points} of the map." if left else ""
-        if self.picking and not map_shown:
+        asked = f"{kind.capitalize()}: click {points} of the map." if left else ""
+        if kind != STOP and not map_shown:
             asked = "The map is hidden; show it to click on points."
         self._asked.content = panel("text", asked) if asked else ""
         rows = [(measure.name, words(at, found, self._where)) for measure, at, found in self._measured]

@@ -258,7 +258,7 @@ def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.V
     bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
     assert bench.measure.picking
     for keyframe in (0, 2):
-        bench.measure._take(bench.measure._kind, Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
+        bench.measure._take(bench.measure._tool, Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
     box = bench.now.clip.hiding
     assert box is not None
     np.testing.assert_allclose(box.middle[:2], [10.0, 0.0], atol=1e-9)
@@ -270,14 +270,14 @@ def test_a_cut_that_is_begun_is_not_ended_in_another_recording(server: viser.Vis
     bench = Bench(server)
     bench.measure.draw(bench.now, View())
     bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
-    bench.measure._take(bench.measure._kind, Spot(0, (0.0, 0.0, 0.0)), bench.now)
+    bench.measure._take(bench.measure._tool, Spot(0, (0.0, 0.0, 0.0)), bench.now)
     bench.draw()
     assert "other end" in bench.panel._asked.content
     bench.now = replace(bench.now, session=bench.now.session + 1)
     bench.measure.draw(bench.now, View())
     bench.draw()
     assert "first end" in bench.panel._asked.content
-    bench.measure._take(bench.measure._kind, Spot(2, (0.0, 0.0, 0.0)), bench.now)
+    bench.measure._take(bench.measure._tool, Spot(2, (0.0, 0.0, 0.0)), bench.now)
     assert bench.now.clip.box is None and bench.measure.picking
 
 
@@ -285,13 +285,13 @@ def test_a_cut_whose_first_end_is_gone_after_going_back_begins_anew(server: vise
     bench = Bench(server)
     bench.measure.draw(bench.now, View())
     bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
-    bench.measure._take(bench.measure._kind, Spot(2, (0.0, 0.0, 0.0)), bench.now)
+    bench.measure._take(bench.measure._tool, Spot(2, (0.0, 0.0, 0.0)), bench.now)
     bench.now = replace(bench.now, chunks=bench.chunks[:2], keyframe_poses=bench.poses[:2])
     bench.measure.draw(bench.now, View())
     bench.draw()
     assert "first end" in bench.panel._asked.content
     for keyframe in (0, 1):
-        bench.measure._take(bench.measure._kind, Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
+        bench.measure._take(bench.measure._tool, Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
     assert bench.now.clip.box is not None
 
 

@@ -249,6 +249,22 @@ def test_a_click_that_is_met_while_stop_is_pressed_is_dropped(
     assert not bench.sent and not bench.panel.spots
 
 
+def test_a_cut_that_is_stopped_at_its_last_click_does_not_become_a_measure(
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, taken = Bench(server), list[tuple[Spot, ...]]()
+
+    class Pressed(dict[str, int]):
+        def __getitem__(self, kind: str) -> int:
+            bench.panel.begin(STOP)
+            return 1
+
+    bench.panel.begin(POINT, lambda spots, _: taken.append(spots))
+    monkeypatch.setattr("app.ui.measure._SPOTS", Pressed())
+    bench.panel._take(bench.panel._tool, spot_at((0.0, 0.0, 0.8)), bench.now)
+    assert not bench.sent and len(taken) == 1
+
+
 def test_a_number_that_a_deleted_measure_had_is_free_again_and_no_other(server: viser.ViserServer) -> None:
     bench, names = Bench(server), []
     bench.panel.begin(POINT)
