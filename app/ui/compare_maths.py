@@ -151,7 +151,8 @@ def how(a: Snapshot, b: Snapshot) -> tuple[str, str]:
     errors = [one.text for one in b.notices if one.level == "error" and one.text not in unsaved]
     trouble = errors[-1] if errors else ""
     if abs(behind) > 1:
-        return f"B is {abs(behind):,} frames {'behind' if behind > 0 else 'ahead'}. {trouble}".strip(), WARN
+        ended = ", where its part of the recording ends" if behind > 0 and b.transport.finished else ""
+        return f"B is {abs(behind):,} frames {'behind' if behind > 0 else 'ahead'}{ended}. {trouble}".strip(), WARN
     return (f"B: {trouble}", BAD) if trouble else ("", "")
 
 

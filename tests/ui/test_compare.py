@@ -342,6 +342,8 @@ def test_the_page_says_how_b_is_doing(page: Page) -> None:
     broken = replace(a, notices=(Notice(1, "error", "it broke"), Notice(2, "error", "disk full")))
     assert "disk full" in how(a, broken)[0]
     assert how(a, replace(broken, saved=(Saved(Path("out"), "disk full"),)))[0] == "B: it broke"
+    ended = replace(a, transport=replace(a.transport, frame=5, finished=True))
+    assert how(a, ended)[0] == "B is 15 frames behind, where its part of the recording ends."
 
 
 def test_a_page_with_a_fork_at_rest_sends_nothing(page: Page, wire: Wire) -> None:
