@@ -229,7 +229,8 @@ class Player:
         try:
             entry = session.peek()
         except Exception as error:  # frames processed so far stay
-            self.fail("The recording cannot be read any further", error)
+            repeatable = session.feed.repeatable
+            self.fail("The recording cannot be read any further" if repeatable else "The live source has ended", error)
             self._page.show(finished=True)
             return None
         if entry is None:
