@@ -305,6 +305,8 @@ class Controller:
         self._base, self._params = base, params
         self._player.halt()
         self._take(session)
+        if not session.feed.repeatable:
+            self._player.play()
 
     def _reopen(self, stay: bool) -> None:
         """Restart with the present parameters. User data stays; loop edits stay only if the keyframes are the same."""

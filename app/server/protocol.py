@@ -91,7 +91,7 @@ class LoadParams(Command, frozen=True):
 
 
 class OpenRecording(Command, frozen=True):
-    """Leave the present recording and open another one at its first frame."""
+    """Leave the present recording and open another one at its first frame; a live source is played from then on."""
 
     path: Path
     truth: Path | None = None

@@ -6,7 +6,7 @@ from typing import Final
 import viser
 
 from app.sensors.live.status import Counters, LiveState
-from app.server.protocol import LIVE, OpenRecording, Play, Snapshot
+from app.server.protocol import LIVE, OpenRecording, Snapshot
 from app.ui.files import size_text
 from app.ui.html import BAD, GOOD, QUIET, WARN, Tile, number, panel
 from app.ui.widgets import Page, add_button
@@ -101,22 +101,17 @@ class LivePanel:
     """The panel in the caller's container; while a recording is open, a button that returns to the live source."""
 
     def __init__(self, page: Page) -> None:
-        self._page = page
         self._html = page.gui.add_html("")
         hint = "Start a new map with the last scans that wait, ten seconds at most. The file of --record has no gap."
         self._back = add_button(
             page.gui,
             "Back to the live source",
-            lambda _: self._open_source(),
+            lambda _: page.send(OpenRecording(LIVE)),
             viser.Icon.BROADCAST,
             visible=False,
             hint=hint,
         )
         self._was_live = False
-
-    def _open_source(self) -> None:
-        self._page.send(OpenRecording(LIVE))
-        self._page.send(Play())
 
     def draw(self, snapshot: Snapshot) -> None:
         live, transport = snapshot.live, snapshot.transport

@@ -253,8 +253,7 @@ def test_a_recording_that_is_opened_after_a_live_session_is_not_live(live: Live)
     live.engine.send(OpenRecording(SAMPLE, None))
     opened = live.until(lambda now: now.recording is not None and now.recording.path == SAMPLE)
     assert opened.live is None, "the page would offer no timeline, no truth and no search for parameters"
-    for command in (OpenRecording(LIVE), Play()):  # as the page's way back
-        live.engine.send(command)
+    live.engine.send(OpenRecording(LIVE))
     live.until(lambda now: now.live is not None and now.transport.playing and now.progress is None)
     live.play(4.0)
     mapped = live.until(lambda now: now.transport.frame >= 10)
@@ -275,3 +274,16 @@ def test_paused_the_source_is_still_watched_and_its_end_is_said_and_survived(liv
     assert "The live source has ended" in ended.notices[-1].text
     assert live.engine.pid == pid and ended.engine_alive
     assert ended.transport.frame == paused.transport.frame, "what was mapped stays"
+    live.engine.send(Play())
+    again = live.until(lambda s: s.last_notice > ended.last_notice)
+    assert again.notices[-1].text == ended.notices[-1].text, "it is no recording"
+
+
+def test_a_way_back_to_a_source_that_has_ended_plays_no_recording_instead(live: Live) -> None:
+    live.until(lambda now: now.live is not None)
+    live.engine.send(OpenRecording(SAMPLE, None))
+    opened = live.until(lambda now: now.recording is not None and now.recording.path == SAMPLE)
+    live.source.close()
+    live.engine.send(OpenRecording(LIVE))
+    refused = live.until(lambda now: now.last_notice > opened.last_notice and now.progress is None)
+    assert refused.notices[-1].level == "error" and not refused.transport.playing

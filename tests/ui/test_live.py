@@ -11,7 +11,7 @@ import pytest
 import viser
 
 from app.sensors.live.status import Counters, LiveState
-from app.server.protocol import LIVE, Command, OpenRecording, Play, StepFrame
+from app.server.protocol import LIVE, Command, OpenRecording, StepFrame
 from app.ui.html import BAD, GOOD, WARN
 from app.ui.live import LivePanel, live_html, verdict
 from app.ui.transport import TransportPanel, state, where
@@ -124,7 +124,7 @@ def test_from_a_recording_there_is_a_way_back_to_the_live_source(server: viser.V
     panel.draw(recorded)
     assert panel._back.visible
     user_clicks(panel._back)
-    assert sent == [OpenRecording(LIVE), Play()]
+    assert sent == [OpenRecording(LIVE)]
 
 
 def test_nothing_is_sent_while_nothing_changes(server: viser.ViserServer, engine: FakeEngine, wire: Wire) -> None:
