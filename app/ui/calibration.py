@@ -90,7 +90,8 @@ class CalibrationPanel:
             self._announce()
         for message in self._work.messages():
             self._show(message)
-        self._apply.disabled = self._keep.disabled = self._work.running
+        self._keep.disabled = self._work.running
+        self._apply.disabled = self._work.running or not snapshot.engine_alive  # it would lose the parameters
 
     def close(self) -> None:
         """Stop a calibration in progress."""

@@ -98,6 +98,14 @@ def test_a_click_finds_and_another_applies_what_was_found(page: Calibrating) -> 
     assert page.sent[3:] == [SetParams({"sensor.rotation": (0.0, 0.0, 0.0)}), Restart(stay=True), Calibrated("")]
 
 
+def test_nothing_is_applied_while_there_is_no_engine_to_take_it(page: Calibrating) -> None:
+    page.found(FoundMounting([], FOUND))
+    page.draw(replace(OPEN, engine_alive=False))
+    assert page.panel._apply.disabled
+    page.draw(OPEN)
+    assert not page.panel._apply.disabled
+
+
 def test_it_can_be_stopped_and_what_was_applied_before_can_still_be_undone(page: Calibrating) -> None:
     page.found(FoundMounting([], FOUND))
     user_clicks(page.panel._apply)
