@@ -312,7 +312,7 @@ def test_what_is_opened_as_b_is_not_called_a_fork(page: Page, tmp_path: Path) ->
     page.both_at(20)
     page.forks.open(page.forks.keep())
     page.both_at(20)
-    assert "opened beside A" in page.panel._status.content and "forked" not in page.panel._status.content
+    assert "opened side by side" in page.panel._status.content and "forked at" not in page.panel._status.content
 
 
 def test_a_fork_made_elsewhere_is_kept_under_its_own_name_not_that_of_the_last(page: Page, tmp_path: Path) -> None:
