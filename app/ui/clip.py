@@ -77,7 +77,9 @@ class ClipPanel:
             )
         )
         hint = "Click two points: the clip box becomes the slab between them."
-        add_button(gui, "Cut by two clicks", self._begin_cut, viser.Icon.SLICE, hint=hint)
+        add_button(
+            gui, "Cut by two clicks", lambda _: measure.begin(DISTANCE, self._picked), viser.Icon.SLICE, hint=hint
+        )
         self._asked = gui.add_html("")
         self._unrolled = gui.add_checkbox(
             "profile", False, hint="The map along the walked path: distance walked to the right, height up."
@@ -171,19 +173,16 @@ class ClipPanel:
             self._camera.look(OBLIQUE, client)
 
     # --- a section by two clicks -----------------------------------------------------------------
-    def _begin_cut(self, client: viser.ClientHandle) -> None:
-        self._client = client
-        self._measure.begin(DISTANCE, self._picked)
-
     def _picked(self, spots: tuple[Spot, ...], current: Snapshot) -> None:
         first, second = (lie.moved(current.keyframe_poses[spot.keyframe], spot.at) for spot in spots)
-        whole = self._whole()
+        whole, client = self._whole(), self._measure.client
         box = along_line(first, second, current.clip.slab, whole.low[2], whole.high[2])
-        if box is None:
-            notify_error(self._client, "The two points are one above the other; click two that are apart.")
-            return
-        self._send(box=box, on=True, unrolled=False)
-        self._face(self._client, box)
+        if box is not None:
+            self._send(box=box, on=True, unrolled=False)
+        if box is not None and client is not None:
+            self._face(client, box)
+        elif client is not None:
+            notify_error(client, "The two points are one above the other; click two that are apart.")
 
     # --- in the scene ----------------------------------------------------------------------------
     def _draw_scene(self, box: Box | None) -> None:

@@ -37,7 +37,7 @@ class MeasurePanel:
     """Widgets in the caller's container, and the measures in the scene, below the map's node.
 
     Attributes:
-        spots: clicked so far, of the unfinished measure.
+        spots: clicked so far, of the unfinished measure. client: the browser of the newest click.
     """
 
     def __init__(self, page: Page) -> None:
@@ -48,6 +48,7 @@ class MeasurePanel:
         self._where: GeoReference | None = None
         self._click: tuple[F64, F64, float] | None = None  # newest click: its ray in the map, and its angular radius
         self.spots: tuple[Spot, ...] = ()
+        self.client: viser.ClientHandle | None = None
         self._session = -1  # session of these spots
         self._nodes: list[Any] = []
         self._measured: list[tuple[Measure, F64, Numbers]] = []
@@ -170,6 +171,7 @@ class MeasurePanel:
         """Take a click in the scene while measuring; `draw` uses it. Returns whether it was taken."""
         if not self.picking:
             return False
+        self.client = event.client
         self._click = (*self._page.in_map(event), _WIDTH * event.client.camera.fov)
         return True
 

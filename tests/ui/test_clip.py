@@ -21,7 +21,7 @@ from app.slam.types import NON_GROUND
 from app.ui.chunks import MapChunks
 from app.ui.clip import ClipPanel
 from app.ui.clip_maths import FACES, along_line, carried, edges, handle, pulled
-from app.ui.measure import MeasurePanel
+from app.ui.measure import DISTANCE, MeasurePanel
 from app.ui.measure_maths import meet
 from app.ui.profile import ProfileNode, unrolled
 from app.ui.widgets import View
@@ -255,7 +255,8 @@ def test_a_number_that_arrives_just_before_an_older_snapshot_is_kept(
 def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.ViserServer) -> None:
     bench = Bench(server)
     bench.now = replace(bench.now, clip=Clip(slab=0.5))
-    bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
+    bench.measure.client = bench.client  # type: ignore[assignment]
+    bench.measure.begin(DISTANCE, bench.panel._picked)
     assert bench.measure.picking
     for keyframe in (0, 2):
         bench.measure._take(bench.measure._tool, Spot(keyframe, (0.0, 0.0, 0.0)), bench.now)
@@ -264,12 +265,13 @@ def test_two_clicks_cut_a_slab_and_the_camera_looks_at_its_front(server: viser.V
     np.testing.assert_allclose(box.middle[:2], [10.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(box.size[:2], [20.0, 0.5])
     assert len(bench.faced) == 1 and not bench.measure.picking
+    assert bench.faced[0][0] is bench.measure.client, "not that of the button, which may have been reloaded since"
 
 
 def test_a_cut_that_is_begun_is_not_ended_in_another_recording(server: viser.ViserServer) -> None:
     bench = Bench(server)
     bench.measure.draw(bench.now, View())
-    bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
+    bench.measure.begin(DISTANCE, bench.panel._picked)
     bench.measure._take(bench.measure._tool, Spot(0, (0.0, 0.0, 0.0)), bench.now)
     bench.draw()
     assert "other end" in bench.panel._asked.content
@@ -284,7 +286,7 @@ def test_a_cut_that_is_begun_is_not_ended_in_another_recording(server: viser.Vis
 def test_a_cut_whose_first_end_is_gone_after_going_back_begins_anew(server: viser.ViserServer) -> None:
     bench = Bench(server)
     bench.measure.draw(bench.now, View())
-    bench.panel._begin_cut(bench.client)  # type: ignore[arg-type]
+    bench.measure.begin(DISTANCE, bench.panel._picked)
     bench.measure._take(bench.measure._tool, Spot(2, (0.0, 0.0, 0.0)), bench.now)
     bench.now = replace(bench.now, chunks=bench.chunks[:2], keyframe_poses=bench.poses[:2])
     bench.measure.draw(bench.now, View())
