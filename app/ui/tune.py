@@ -43,6 +43,7 @@ class TunePanel:
         self._page, self._forks, self._sides, self._folder = page, forks, sides, folder
         self._wanted: Wanted | None = None  # by the newest search
         self._found, self._chosen = Tried(), -1
+        self._failure = ""  # why it ended early; a browser that was reloaded missed the notification
         self._opened = ""  # name of the trial that is B, as long as B has been nothing else
         self._runs: list[tuple[float, int]] = []  # (time, finished runs), since the last run that took no time
         self._changes = Changes(page.now, PANEL_PERIOD_S)
@@ -111,7 +112,8 @@ class TunePanel:
             return f"{done} · {self._left(wanted)}" if self._runs else "The first trial uses the given parameters."
         if not found.finished:
             failed = bool(found.trials) and all(trial.error for trial in found.trials)
-            return f"{done} · stopped" + (f" · all failed: {found.trials[0].error}" if failed else "")
+            why = f"all failed: {found.trials[0].error}" if failed else self._failure
+            return " · ".join(filter(None, (done, "stopped", why)))
         best = advice(found.trials, found.held_back, self._objectives())
         return " · ".join(filter(None, (done, f"saved in {wanted.folder}", best)))
 
@@ -138,6 +140,7 @@ class TunePanel:
                         self.close()
                 case sentence:
                     self.close()
+                    self._failure = str(sentence)
                     self._page.notify_error(sentence)
 
     def _begin(self) -> None:
@@ -189,7 +192,7 @@ class TunePanel:
     def _run(self) -> None:
         """Begin or continue: a search reuses runs that finished before."""
         if self._wanted is not None and not self._work.running:
-            self._found, self._runs, self._chosen = Tried(), [], -1
+            self._found, self._runs, self._chosen, self._failure = Tried(), [], -1, ""
             self._work.begin(find, self._wanted)
 
     def _clicked(self, word: str, _: viser.ClientHandle) -> None:

@@ -147,6 +147,17 @@ def test_a_click_never_discards_a_trial_that_was_worked_on_as_a(tuning: Tuning) 
     assert tuning.forks.names[1] == "trial 1" and "already" in told[0]
 
 
+def test_why_a_search_has_failed_stays_on_the_page_until_the_next_one(tuning: Tuning) -> None:
+    """A notification is lost on a page that is reloaded meanwhile."""
+    user_clicks(tuning.panel._start)
+    tuning.draw("There is no parameter ground.alfa; did you mean ground.alpha?")
+    tuning.draw()
+    assert tuning.process is None and tuning.says("0 of 49 trials · stopped · There is no parameter ground.alfa")
+    user_clicks(tuning.panel._start)
+    tuning.draw()
+    assert not tuning.says("ground.alfa")
+
+
 def test_what_cannot_be_measured_is_refused_in_a_sentence(tuning: Tuning) -> None:
     user_sets(tuning.panel._first, OBJECTIVES["ate"].title)
     user_clicks(tuning.panel._start)
