@@ -241,7 +241,7 @@ class Player:
         if isinstance(entry, Quiet):
             status = entry.status
             if status is not None and status.kind == "jump":  # two senders on one port cause hundreds
-                self._page.notice_once(f"Live: {status.text}.", status.at_ns)
+                self._page.notice_once(f"Live: {status.text}.", round(self._clock() * 1e9))
             elif status is not None:
                 self._page.notice("warning" if status.kind in _WARNINGS else "info", f"Live: {status.text}.")
             return 0.0

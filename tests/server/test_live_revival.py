@@ -178,15 +178,14 @@ def test_a_clock_that_jumps_all_the_time_does_not_bury_the_page_in_messages(
 ) -> None:
     """As with two senders on one port."""
     jumps = [
-        Status("jump", "IMU", f"the IMU's clock was set by {53.3 * (-1) ** k:+.3f} s; its time continues", 10**7 * k)
-        for k in range(2000)
+        Status("jump", f"the IMU's clock was set by {53.3 * (-1) ** k:+.3f} s; its time continues") for k in range(2000)
     ]
     with given([*jumps, *events], tmp_path) as address:
         bench = Bench(address, params, tmp_path)
         while bench.session is None or bench.session.frame < 0:
             bench.controller.work()
         bench.tell()
-    assert sum("clock was set" in notice.text for notice in bench.page.notices) == 4, "twice in 20 s, each way"
+    assert sum("clock was set" in notice.text for notice in bench.page.notices) == 2, "once in ten seconds, each way"
 
 
 def test_a_paused_map_that_a_new_engine_took_over_has_its_time_and_can_be_saved(

@@ -16,6 +16,7 @@ from app.server.protocol import (
     Command,
     CompareWith,
     LoadParams,
+    OpenRecording,
     Pause,
     Play,
     Restart,
@@ -43,6 +44,12 @@ def test_playing_for_a_second_replays_a_second_times_the_speed(speed: float, fra
     bench = Bench()
     bench.do(SetSpeed(speed), Play())
     assert bench.pass_time(1.0).transport.frame == pytest.approx(frames, abs=1)
+
+
+def test_each_notice_names_the_recording_that_was_open() -> None:
+    snapshot = Bench().do(SetSpeed(0.0), OpenRecording(Path("walk-30.mcap")))
+    told = [(one.recording, one.text.split(" ")[0]) for one in snapshot.notices]
+    assert told == [("walk-60.mcap", "IMU"), ("walk-60.mcap", "The"), ("walk-30.mcap", "IMU")]
 
 
 def test_as_fast_as_it_can_needs_no_time_and_stops_at_the_end() -> None:

@@ -50,12 +50,6 @@ def test_opening_another_recording_empties_the_scene_and_pauses() -> None:
     assert len(snapshot.trajectory) == 1 and len(snapshot.chunks) == 1
 
 
-def test_each_notice_names_the_recording_that_was_open() -> None:
-    snapshot = Bench().do(SetSpeed(0.0), OpenRecording(Path("walk-30.mcap")))
-    told = [(one.recording, one.text.split(" ")[0]) for one in snapshot.notices]
-    assert told == [("walk-60.mcap", "IMU"), ("walk-60.mcap", "The"), ("walk-30.mcap", "IMU")]
-
-
 def test_a_file_that_can_not_be_opened_leaves_the_session_as_it_is() -> None:
     bench = Bench()
     bench.do(Play())
