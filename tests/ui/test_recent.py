@@ -118,6 +118,6 @@ def test_results_are_limited_to_the_clip_box_that_the_page_shows_now(
     browser = Browser(server, monkeypatch)
     files.ask_where(browser)  # type: ignore[arg-type]
     now[0] = replace(now[0], clip=after)  # another page moves the box
-    browser.added["Save"]._impl.update_cb[0](None)
+    browser.clicks("Save")
     (save,) = sent
     assert isinstance(save, Save) and (save.choice.box, save.choice.slab) == (after.box, after.slab)
