@@ -153,7 +153,7 @@ class Workbench:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(child, signal.SIGKILL)
         if kind in ("engine", "loops"):
-            # An engine at rest misses its loop search only when it asks again.
+            # An engine at rest notices that its loop search has died only when it asks it again.
             deadline = time.monotonic() + (TIMEOUT_S if kind == "engine" else AT_REST_S)
             while self.child(name) in (None, child) and time.monotonic() < deadline:
                 time.sleep(0.01)

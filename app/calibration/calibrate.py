@@ -30,8 +30,8 @@ READING, ROUND = 0.1, 0.9 / (ROUNDS + 1)
 LARGEST_ROTATION, LARGEST_PLACE, LARGEST_OFFSET = np.radians(1.0), 0.05, 0.002
 """rad, m, s: values with a larger standard deviation count as not observable."""
 NOT_TURNED = np.radians(20.0)
-"""rad: if scans alone leave every axis of the rotation this uncertain, the help of the IMU would mislead; if any, its
-accelerations cannot be compared."""
+"""rad: an axis of the rotation that scans alone leave this uncertain is not observed. If none is observed, the help of
+the IMU would mislead. Its accelerations can be compared only if all are."""
 SURE = 3.0
 """Standard deviations by which two values must differ to count as different."""
 APART_ROTATION, APART_PLACE = np.radians(3.0), 0.1

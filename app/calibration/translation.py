@@ -82,7 +82,10 @@ def fit_translation(track: Track, inertial: Inertial, turned: Turned, given: F64
 
 
 def is_opposed(track: Track, inertial: Inertial, turned: Turned, moved: Moved) -> bool:
-    """Whether the accelerations fit the LiDAR's motion far better with the opposite sign; some drivers send gravity."""
+    """Whether the accelerations fit the LiDAR's motion far better with the opposite sign.
+
+    Some drivers send gravity, which points down. An accelerometer measures the opposite.
+    """
     opposite = fit_translation(track, replace(inertial, accel=-inertial.accel), turned, np.zeros(3))
     off, right = (np.median(np.linalg.norm(fit.after, axis=1)) for fit in (opposite, moved))
     return bool(off < CLEARLY * right)

@@ -24,10 +24,10 @@ ACCELERATION_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY
 GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 _GYROSCOPE_OPTION = "--set recording.gyroscope_unit="
 
-PARTS, LEAST_STEADY = 5, 0.5
-"""If the first samples are averaged in this many parts, 4 s each, at least this share of their norm remains: while
-walking 0.96 to 1.01 with gravity, and 0.07 without."""
-LEAST_GRAVITY = 0.5
+PARTS, LEAST_SHARE = 5, 0.5
+"""The first samples are averaged in this many parts of about 4 s. With gravity, an average has at least this share of the
+samples' norm: on walks 0.96 to 1.01, and 0.07 without gravity."""
+LEAST_NORM = 0.5
 """Gravity is larger than this in every unit that an IMU uses."""
 MOST_ACCEL = 200.0
 """m/s^2; a larger value is not a walking motion."""
@@ -61,12 +61,14 @@ def measured(gyro: F64, accel: F64) -> Mask:
 
 
 def holds_gravity(probe: ImuProbe) -> bool:
-    """Whether the accelerations average to more than those of a walk, which cancel out. Some drivers take gravity off,
-    and some IMUs read zeros."""
+    """Whether the accelerations contain gravity. Those of walking average out over some seconds; gravity does not.
+
+    Some drivers take gravity off, and some send only zeros.
+    """
     parts = np.array_split(probe.accel, min(PARTS, len(probe.accel)))
-    steady = float(np.median([np.linalg.norm(part.mean(axis=0)) for part in parts]))
-    usual = float(np.median(np.linalg.norm(probe.accel, axis=1)))
-    return usual > LEAST_GRAVITY and steady > LEAST_STEADY * usual
+    averaged = float(np.median([np.linalg.norm(part.mean(axis=0)) for part in parts]))
+    norm = float(np.median(np.linalg.norm(probe.accel, axis=1)))
+    return norm > LEAST_NORM and averaged > LEAST_SHARE * norm
 
 
 Axes = tuple[tuple[int, float], ...]

@@ -28,7 +28,7 @@ ONLY_ON = "A live source cannot go back; record it, then open the recording."
 FIRST_DOUBT = 100
 """A run is first checked for doubts after this many frames, then each time this number has doubled, and at the end."""
 _WARNINGS = ("disconnected", "silent", "recording", "units", "restarted")
-"""Kinds of `Status` that are warnings, as is a jump of a clock, and not just information."""
+"""Kinds of `Status` that are always told, as warnings. A jump of a clock is a warning too, but told less often."""
 
 
 class Pacer:

@@ -239,7 +239,7 @@ def test_a_tooltip_covers_no_control(bench: Bench) -> None:
 
 
 def test_a_button_says_on_hover_what_it_does(bench: Bench) -> None:
-    """viser itself shows no hints of buttons."""
+    """viser itself shows no hint for a button."""
     bench.page.get_by_role("tab", name="A/B").click()
     fork = bench.page.get_by_role("button", name="Fork here")
     expect(fork).to_have_attribute("title", "Continue from this frame with other parameters, side by side.")

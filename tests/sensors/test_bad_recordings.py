@@ -377,7 +377,7 @@ def test_a_recording_whose_imu_feels_no_gravity_is_mapped_by_the_lidar_alone(
     chosen = Params().with_values({"recording.acceleration_unit": "m/s2"})
     if felt is steps_alone:
         with open_recording(path, chosen) as recording:
-            assert recording.imu_topic == "/imu", "whoever names the unit knows better"
+            assert recording.imu_topic == "/imu", "a unit that the user sets is used"
 
 
 @pytest.mark.parametrize(("container", "suffix"), [("bare-mcap", ".MCAP"), ("bag", ".BAG"), ("bare-db3", ".Db3")])

@@ -51,7 +51,7 @@ _TOO_FAST_SAMPLES = 20
 _AHEAD_NS, _LATE_NS = -50_000_000, 2_000_000_000
 """If the age of stamps on arrival is between these, they are taken as the time of day."""
 _MOST_ONCE = 100
-"""Most news of one connection that are each put once: a network may hold any number of senders."""
+"""At most this many messages that are put only once are remembered; a network may hold any number of senders."""
 BUSY = "too many scans waited (mapping was paused, or slower than the scanner)"
 NO_IMU = "no IMU sample came to cover it"
 
@@ -131,7 +131,7 @@ class Intake:
             self._put(ImuEntry(arrival_ns, stamp_ns, gyro, accel))
 
     def put_status(self, kind: Kind, text: str, *, once: bool = False) -> None:
-        """Add news. once: not if it was added before, since a source was last connected."""
+        """Add news. once: unless the same was added since the source last connected."""
         with self._changed:
             if kind == "connected":
                 self._put_once.clear()

@@ -86,11 +86,11 @@ new MutationObserver((changes) => {
   for (const {target: tab} of changes) if (tab.role === 'tab' && tab.ariaSelected === 'true') hemislamTell('opened', tab.textContent.trim());
 }).observe(document.body, {subtree: true, attributeFilter: ['aria-selected']});
 
-// viser shows the hints of all controls but buttons. React keeps a button's message at its element.
+// viser shows a hint for every control but a button. The button's message is in React's data at its element.
 const hintOf = (button) => {
   const kept = (kind) => button[Object.keys(button).find((key) => key.startsWith(kind))];
   let part = kept('__reactFiber');
-  if (part?.memoizedProps !== kept('__reactProps')) part = part?.alternate; // the other one is of before
+  if (part?.memoizedProps !== kept('__reactProps')) part = part?.alternate; // React keeps two, and one may be outdated
   while (part && !/^Gui(Upload)?ButtonMessage$/.test(part.memoizedProps?.type)) part = part.return;
   return part?.memoizedProps.props.hint || '';
 };
