@@ -10,7 +10,7 @@ import yaml
 from app.calibration.calibrate import Calibration
 from app.calibration.inertial import Noise
 from app.calibration.lines import Lines
-from app.sensors.presets import CALIBRATED, MERGED, sidecar, uncalibrated
+from app.sensors.presets import CALIBRATED, MERGED, kept_sidecar, sidecar, uncalibrated
 from app.slam.errors import HemislamError
 from app.slam.params import nested
 from app.slam.report import finite
@@ -106,7 +106,7 @@ def write_beside(recording: Path, found: Mapping[str, Any]) -> Path:
         tree = read_yaml(before, str(mine), "write it again") or {}
         for section, values in nested(found).items():
             tree[section] = (tree.get(section) or {}) | values
-        texts = {f"{path.name}.old": before, path.name: f"{MERGED}\n{_yaml(tree)}"}
+        texts = {kept_sidecar(recording).name: before, path.name: f"{MERGED}\n{_yaml(tree)}"}
     write_texts(path.parent, texts)
     return path
 

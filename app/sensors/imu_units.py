@@ -25,8 +25,8 @@ GYROSCOPE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 _GYROSCOPE_OPTION = "--set recording.gyroscope_unit="
 
 PARTS, LEAST_SHARE = 5, 0.5
-"""The first samples are averaged in this many parts of about 4 s. With gravity, an average has at least this share of the
-samples' norm: on walks 0.96 to 1.01, and 0.07 without gravity."""
+"""The first samples are averaged in this many parts of about 4 s. With gravity, an average has at least this share of
+the samples' norm: on walks 0.96 to 1.01, and 0.07 without gravity."""
 LEAST_NORM = 0.5
 """Gravity is larger than this in every unit that an IMU uses."""
 MOST_ACCEL = 200.0

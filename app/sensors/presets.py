@@ -116,10 +116,15 @@ def sidecar(recording: Path) -> Path:
     return beside(recording, ".params.yaml")
 
 
+def kept_sidecar(recording: Path) -> Path:
+    """Where a user's own file of these is kept while a calibration is merged into a copy."""
+    return beside(recording, ".params.yaml.old")
+
+
 def uncalibrated(recording: Path) -> Path | None:
     """The parameter file beside a recording as its user wrote it, without a calibration; None if there is none."""
     path = sidecar(recording)
-    old, first = path.with_name(f"{path.name}.old"), _first_line(path)
+    old, first = kept_sidecar(recording), _first_line(path)
     if first.startswith(MERGED):
         return old if is_file(old) else path
     return path if is_file(path) and not first.startswith(CALIBRATED) else None
@@ -130,7 +135,7 @@ def calibrated_beside(recording: Path) -> str:
     path, first = sidecar(recording), _first_line(sidecar(recording))
     if not first.startswith(CALIBRATED):
         return ""
-    undo = f"rename {path.name}.old to {path.name}" if first.startswith(MERGED) else "delete it"
+    undo = f"rename {kept_sidecar(recording).name} to {path.name}" if first.startswith(MERGED) else "delete it"
     return f"Using the calibration beside the recording: {path}; {undo} to undo this."
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from app.calibration.calibrate import is_mounting_unknown
 from app.calibration.words import table, write_beside
 from app.child import Link
-from app.sensors.presets import calibrated_beside, sidecar
+from app.sensors.presets import calibrated_beside, kept_sidecar, sidecar
 from app.sensors.recording import NO_GRAVITY, NO_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
@@ -194,7 +194,7 @@ class CalibrationPanel:
         path = sidecar(self._of)
         self._keep.visible = False
         try:
-            both = path, path.with_name(f"{path.name}.old")
+            both = path, kept_sidecar(self._of)
             self._files = {one: one.read_bytes() if one.is_file() else None for one in both}
             write_beside(self._of, self._found.values)
             self._tell(("kept", f"in {path}; applied whenever this recording is opened"))
