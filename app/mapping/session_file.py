@@ -331,12 +331,12 @@ def session_files(folder: Path) -> list[Path]:
     return [path for _, path in sorted(found, reverse=True)]
 
 
-def recording_of(path: Path) -> Path | None:
-    """The recording that a session file names; None if it cannot be read."""
+def opened_in(path: Path) -> Opened | None:
+    """What a session file was opened on; None if it cannot be read."""
     try:
         with path.open(encoding="utf-8") as lines:
-            return Path(json.loads(lines.readline())["recording"])
-    except (OSError, ValueError, RecursionError, KeyError, TypeError):
+            return _OPENED.validate_json(lines.readline())
+    except (OSError, ValueError):  # of pydantic too
         return None
 
 

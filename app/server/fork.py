@@ -19,14 +19,25 @@ from app.mapping.session_file import (
     FORK_START,
     FORKS,
     SUFFIX,
+    Opened,
     SavedSession,
+    opened_in,
     read_session,
-    recording_of,
     session_files,
     write_session,
 )
 from app.server.keeping import AddNote
-from app.server.protocol import Command, CompareWith, Pause, Play, Seek, SetBreakpoints, SetSpeed, Snapshot
+from app.server.protocol import (
+    Command,
+    CompareWith,
+    OpenedRecording,
+    Pause,
+    Play,
+    Seek,
+    SetBreakpoints,
+    SetSpeed,
+    Snapshot,
+)
 from app.server.setup import Seen, Setup
 from app.server.worker import RunningEngine
 from app.slam.errors import HemislamError
@@ -74,6 +85,13 @@ def same_recording(a: Snapshot, b: Snapshot) -> bool:
         return False
     ours, theirs = ((one.path.resolve(), one.start_ns, one.start_s) for one in (a.recording, b.recording))
     return ours == theirs
+
+
+def fits_beside(ours: OpenedRecording | None, theirs: Opened | None) -> bool:
+    """Whether a session file is of A's recording from the same start, so that B can follow A."""
+    if ours is None or theirs is None:
+        return False
+    return (ours.path.resolve(), ours.start_s) == (theirs.recording, theirs.start_s)
 
 
 def follow(a: Snapshot, b: Snapshot) -> Seek | None:
@@ -168,19 +186,19 @@ class Workspace:
             a, folder = self._place(path.stem)
             session, ours = read_session(path), a.engine.snapshot.recording
             theirs = session.opened
-            if ours is None or (ours.path.resolve(), ours.start_s) != (theirs.recording, theirs.start_s):
+            if not fits_beside(ours, theirs):
                 raise HemislamError(f"{path.name} is of {theirs.recording} from {theirs.start_s:g} s; open that first.")
             self._begin(path, session, path.stem, folder, -1)
             a.engine.send(AddNote(f"Opened {path.name} beside this session. {session.left_out}"))
 
     def kept(self) -> list[Path]:
-        """Session files of A's recording that can be opened as B, the newest first."""
+        """Session files of A's recording, from the same start, that can be opened as B, the newest first."""
         a, folder = self._sides[0].engine.snapshot, self._setup.session_folder
-        if folder is None or a.recording is None:
+        if folder is None:
             return []
         ours = a.session_file.resolve() if a.session_file is not None else None
         others = [file for file in session_files(folder) if file.resolve() != ours][:_MOST_KEPT]
-        return [file for file in others if recording_of(file) == a.recording.path.resolve()]
+        return [file for file in others if fits_beside(a.recording, opened_in(file))]
 
     def swap(self) -> None:
         """Swap the two: B becomes A, at A's frame, and A becomes B and follows. Raises HemislamError without a fork."""

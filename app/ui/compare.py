@@ -253,7 +253,12 @@ class ComparePanel:
         kept = self._forks.kept()
         with dialog(client, "Open a session as B") as close:
             if not kept:
-                client.gui.add_html(panel("text", "This recording has no other session yet; fork, then keep the fork."))
+                client.gui.add_html(
+                    panel(
+                        "text",
+                        "No other session of this recording begins where this one does; fork, then keep the fork.",
+                    )
+                )
             for path in kept:
                 add_button(client.gui, path.stem, partial(self._open_beside, path, close))
 

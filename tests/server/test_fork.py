@@ -167,6 +167,20 @@ def test_a_session_is_opened_beside_one_whose_file_cannot_be_written(tmp_path: P
     workspace.close()
 
 
+def test_only_sessions_from_the_same_start_are_offered_as_b(tmp_path: Path) -> None:
+    for name, start_s in (("whole", 0.0), ("later", 10.0)):
+        writer = SessionWriter(tmp_path / f"{name}.hemislam", Opened(tmp_path / "walk.mcap", start_s))
+        writer.write(5, State(Params()))
+        writer.close()
+    (tmp_path / "empty.hemislam").touch()
+    a = Recorder(at(5, name=str(tmp_path / "walk")))
+    workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: Recorder(at(5)))
+    assert workspace.kept() == [tmp_path / "whole.hemislam"]
+    a.snapshot = Snapshot()
+    assert workspace.kept() == []
+    workspace.close()
+
+
 def test_a_fork_knows_only_what_came_before_it(tmp_path: Path) -> None:
     first, later, latest = (Params().with_values({"ground.alpha": alpha}) for alpha in (30.0, 40.0, 50.0))
     writer = SessionWriter(tmp_path / "a.hemislam", Opened(tmp_path / "none.mcap"))
