@@ -4,6 +4,8 @@ import math
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from app.slam.errors import HemislamError
 
 if TYPE_CHECKING:  # imported where it is used: most runs need no coordinate system
@@ -13,6 +15,10 @@ WGS84 = "EPSG:4979"
 """Latitude, longitude and height above the ellipsoid, as GNSS gives them."""
 EARTH_M = 6_371_000.0
 """Mean radius."""
+STEP_M = 50.0
+"""How far the places are from which the stretch of a grid is computed."""
+SAME_STRETCH = 1e-5
+"""Lengths in two directions may differ by this share: 1 mm in 100 m."""
 
 
 @lru_cache(maxsize=32)
@@ -128,12 +134,32 @@ def place(name: str, east: float, north: float) -> tuple[float, float]:
     return latitude, longitude
 
 
-def grid_scale(name: str, latitude: float, longitude: float, height: float) -> float:
-    """Metres of the grid per metre on the ground at a place in degrees and m, such as 0.9996 in the middle of UTM."""
+def stretches(name: str, latitude: float, longitude: float) -> tuple[float, float]:
+    """The greatest and the least metres of a grid per metre on the ellipsoid, over all directions at a place."""
     import pyproj
 
-    try:
-        factors = pyproj.Proj(projected(name)).get_factors(longitude, latitude)
-    except pyproj.exceptions.ProjError:
-        return 1.0
-    return float(math.sqrt(factors.areal_scale) * EARTH_M / (EARTH_M + height))
+    ways = np.array([90.0, 270.0, 0.0, 180.0])
+    geod, here = pyproj.Geod(ellps="WGS84"), (np.full(4, longitude), np.full(4, latitude))
+    east, north = transformer(WGS84, name).transform(*geod.fwd(*here, ways, np.full(4, STEP_M))[:2])
+    steps = [[axis[0] - axis[1], axis[2] - axis[3]] for axis in (east, north)]
+    most, least = np.linalg.svd(steps, compute_uv=False).tolist()
+    return most / (2 * STEP_M), least / (2 * STEP_M)
+
+
+def grid_scale(name: str, latitude: float, longitude: float, height: float) -> float:
+    """Metres of the grid per metre on the ground at a place in degrees and m, such as 0.9996 in the middle of UTM."""
+    most, least = stretches(name, latitude, longitude)
+    return math.sqrt(most * least) * EARTH_M / (EARTH_M + height)
+
+
+def unlike(name: str, east: float, north: float) -> str:
+    """That a grid stretches a map in one direction more than in another, in a sentence; "" if it hardly does."""
+    here = place(name, east, north)
+    most, least = stretches(name, *here)
+    share = most / least - 1.0
+    if share < SAME_STRETCH:
+        return ""
+    return (
+        f"{name} stretches lengths by {100 * share:.2f} % more in one direction than in another, which the map cannot"
+        f" follow, since it keeps its shape; {utm(*here)} does not stretch it so."
+    )

@@ -1,5 +1,7 @@
 """The coordinate system for a place. Oracle: the areas of use stated by EPSG."""
 
+import math
+
 import pyproj
 import pytest
 
@@ -70,6 +72,28 @@ def test_a_grid_of_any_order_of_axes_has_its_first_axis_to_the_east_or_is_refuse
 def test_utm_is_narrower_than_the_ground_in_the_middle_of_a_zone_and_at_height() -> None:
     assert crs.grid_scale("EPSG:32632", 48.0, 9.0, 0.0) == pytest.approx(0.9996, abs=1e-6)
     assert crs.grid_scale("EPSG:32632", 48.0, 9.0, 1000.0) == pytest.approx(0.9996 * (1 - 1.57e-4), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["EPSG:25832", "EPSG:31467", "EPSG:3035", "EPSG:3034"])
+def test_a_grid_stretches_as_the_ellipse_of_its_distortion_says(name: str) -> None:
+    """Oracle: the factors of PROJ."""
+    factors = pyproj.Proj(pyproj.CRS(name)).get_factors(9.5, 48.0)
+    told = factors.tissot_semimajor, factors.tissot_semiminor
+    assert crs.stretches(name, 48.0, 9.5) == pytest.approx(told, rel=2e-5)  # the shift of its datum stretches it too
+
+
+def test_web_mercator_stretches_by_the_radii_of_the_ellipsoid() -> None:
+    """PROJ gives the factors of a sphere for it."""
+    e2, sine, cosine = 0.00669437999, math.sin(math.radians(48.0)), math.cos(math.radians(48.0))
+    across = math.sqrt(1 - e2 * sine**2) / cosine
+    along = (1 - e2 * sine**2) ** 1.5 / (1 - e2) / cosine
+    assert crs.stretches("EPSG:3857", 48.0, 11.0) == pytest.approx((along, across), rel=1e-8)
+
+
+def test_a_grid_that_changes_the_shape_of_a_map_is_told() -> None:
+    told = crs.unlike("EPSG:3857", 1_288_513.8, 6_129_650.0)
+    assert "EPSG:3857 stretches lengths by 0.30 % more in one direction" in told and "EPSG:32632" in told
+    assert crs.unlike("EPSG:32632", 691_561.7, 5_334_716.1) == ""
 
 
 def test_heights_stand_in_the_text_of_a_coordinate_system() -> None:
