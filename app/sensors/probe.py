@@ -9,7 +9,7 @@ import numpy as np
 
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, Probe, stamped
 from app.sensors.findings import Finding
-from app.sensors.imu_units import ImuProbe, measured
+from app.sensors.imu_units import ImuProbe, holds_gravity, measured
 from app.sensors.ros import IMU, imu_values, stamp_fault, stamp_ns
 from app.sensors.source import Source, Topic
 from app.slam.errors import HemislamError
@@ -23,6 +23,25 @@ PACKETS = {
     "VelodyneScan", "PacketMsg", "RslidarPacket", "rslidarScan", "PandarScan", "UdpFrame", "UdpPacket", "NebulaPackets"
 }  # fmt: skip
 """Names of message types that hold raw packets: of the Velodyne, Ouster, RoboSense and Hesai drivers, and of Nebula."""
+
+
+def _set_aside(why: str) -> Finding:
+    text = (
+        f"{why}, so the IMU is not used: motion is estimated from the LiDAR alone, less accurately, and not in quick "
+        "turns; have the driver send raw accelerations, or start hemislam with --imu-topic and another topic"
+    )
+    return Finding("IMU topic", "needs you", text)
+
+
+NO_IMU = Finding(
+    "IMU topic",
+    "corrected",
+    "there is no IMU: motion is estimated from the LiDAR alone, less accurately, and not in quick turns",
+)
+NO_GRAVITY = _set_aside("its accelerations hold no gravity")
+NO_NUMBERS = _set_aside("its first samples are all NaN or absurd")
+WITHOUT_IMU = frozenset({NO_IMU, NO_GRAVITY, NO_NUMBERS})
+"""One of these is among the findings if the LiDAR is used alone."""
 
 
 def usable_types(sensor: Literal["lidar", "imu"]) -> tuple[str, ...]:
@@ -130,11 +149,7 @@ def probe_clouds(source: Source, topic: Topic) -> tuple[list[Probe], list[Findin
 
 
 def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProbe, bool, list[Finding]]:
-    """The first IMU samples that are numbers, whether their headers carry time, and findings.
-
-    Raises:
-        HemislamError: all of them are NaN.
-    """
+    """The first IMU samples that are numbers, which may be none, whether their headers carry time, and findings."""
     logs, stamps, values = [], [], []
     for log_ns, message in _until_damage(source.readable(topic)):
         logs.append(log_ns)
@@ -145,14 +160,16 @@ def probe_imu(source: Source, topic: str, time_offset_s: float) -> tuple[ImuProb
     findings = _stamp_findings(stamps, topic)
     rows = np.array(values, np.float64).reshape(-1, 6)
     good = measured(rows[:, :3], rows[:, 3:])
-    if not good.any():
-        raise HemislamError(
-            f"The first {len(rows)} IMU samples on {topic} in {source.path} are all NaN or absurd; "
-            "check the IMU's driver."
-        )
     times = np.array(logs if findings else stamps, np.int64) + round(time_offset_s * 1e9)
     probe = ImuProbe(np.array(logs, np.int64)[good], times[good], rows[good, :3], rows[good, 3:])
     return probe, not findings, findings
+
+
+def unfit_imu(imu: ImuProbe, unit: str) -> Finding | None:
+    """Why the IMU cannot be used, if so. Gravity is not asked for if the user sets the unit."""
+    if not len(imu.accel):
+        return NO_NUMBERS
+    return None if unit != "auto" or holds_gravity(imu) else NO_GRAVITY
 
 
 def _stamp_findings(stamps: list[int], topic: str) -> list[Finding]:

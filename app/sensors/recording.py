@@ -13,7 +13,7 @@ from app.sensors.clocks import clock_finding, is_copy, overlap_finding
 from app.sensors.cloud_types import CLOUD_TYPES, CloudError, CloudMessage, Probe
 from app.sensors.distances import distance_findings
 from app.sensors.findings import Finding
-from app.sensors.imu_units import AS_RECORDED, ImuProbe, gravity_findings, holds_gravity, settle_imu
+from app.sensors.imu_units import AS_RECORDED, ImuProbe, gravity_findings, settle_imu
 from app.sensors.layout import settle_cloud
 from app.sensors.leaps import (
     AROUND_NS,
@@ -29,7 +29,7 @@ from app.sensors.leaps import (
 from app.sensors.navsat import fix_of, navsat_topic
 from app.sensors.pointcloud import decode, read_scan
 from app.sensors.presets import preset_for
-from app.sensors.probe import choose_topic, probe_clouds, probe_imu, usable_types
+from app.sensors.probe import NO_IMU, choose_topic, probe_clouds, probe_imu, unfit_imu, usable_types
 from app.sensors.rings import line_findings
 from app.sensors.ros import Lost, imu_values, stamp_ns
 from app.sensors.sequencer import Sequencer
@@ -42,18 +42,6 @@ SILENCE_S = 0.5
 """A gap without scans at the end, while the IMU continues, is reported if it is longer than this."""
 LOST = "its part of the file is damaged"
 LACKS = "the file is damaged: its index tells of more messages than there are"
-NO_IMU = Finding(
-    "IMU topic",
-    "corrected",
-    "there is no IMU: motion is estimated from the LiDAR alone, less accurately, and not in quick turns",
-)
-NO_GRAVITY = Finding(
-    "IMU topic",
-    "needs you",
-    "its accelerations hold no gravity, so the IMU is not used: motion is estimated from the LiDAR alone, less "
-    "accurately, and not in quick turns; have the driver send raw accelerations, or start hemislam with --imu-topic "
-    "and another topic",
-)
 IMU_BEFORE_NS = 200_000_000
 """IMU samples given from before `start_s`."""
 
@@ -124,8 +112,8 @@ class Recording(AbstractContextManager["Recording"]):
         self._imu_stamped = True
         if self.imu_topic:
             imu, self._imu_stamped, imu_findings = probe_imu(source, self.imu_topic, chosen.imu_time_offset)
-            if chosen.acceleration_unit == "auto" and not holds_gravity(imu):
-                self.imu_topic, topic_finding, imu, imu_findings = "", NO_GRAVITY, None, []
+            if unfit := unfit_imu(imu, chosen.acceleration_unit):
+                self.imu_topic, topic_finding, imu, imu_findings = "", unfit, None, []
         self.scan_count = lidar.messages
         self.gnss_topic = navsat_topic(source)
         self._topics = tuple(filter(None, (self.lidar_topic, self.imu_topic, self.gnss_topic)))

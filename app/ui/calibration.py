@@ -13,7 +13,7 @@ from app.calibration.calibrate import is_mounting_unknown
 from app.calibration.words import table, write_beside
 from app.child import Link
 from app.sensors.presets import calibrated_beside, kept_sidecar, sidecar
-from app.sensors.recording import NO_GRAVITY, NO_IMU
+from app.sensors.probe import WITHOUT_IMU
 from app.server.protocol import LIVE, Calibrated, Restart, SetParams, Snapshot
 from app.slam.doubts import IN_DOUBT
 from app.slam.errors import HemislamError, refusal
@@ -217,7 +217,7 @@ class CalibrationPanel:
 
 def _is_unknown(snapshot: Snapshot) -> bool:
     """Whether there is a usable IMU, and the pose of the LiDAR on it was not given."""
-    has_imu = snapshot.recording is not None and not {NO_IMU, NO_GRAVITY} & {*snapshot.recording.findings}
+    has_imu = snapshot.recording is not None and WITHOUT_IMU.isdisjoint(snapshot.recording.findings)
     return has_imu and is_mounting_unknown(snapshot.params) and not snapshot.resumed
 
 

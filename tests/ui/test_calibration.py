@@ -12,7 +12,7 @@ import viser
 from app.calibration.words import write_beside
 from app.mapping.kept import Note
 from app.sensors.presets import calibrated_beside, resolve_params, sidecar
-from app.sensors.recording import NO_IMU
+from app.sensors.probe import NO_IMU
 from app.server.protocol import (
     Calibrated,
     Command,
