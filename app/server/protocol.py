@@ -110,7 +110,7 @@ class Calibrated(Command, frozen=True):
 
 
 class Restart(Command, frozen=True):
-    """Restart the present recording with the present parameters; loop edits and notes stay.
+    """Restart the present recording with the present parameters; loop edits and notes stay, but not on a live source.
 
     stay: return to the frame that was shown, or that the session was going to.
     """

@@ -167,6 +167,16 @@ def test_a_restart_keeps_the_notes() -> None:
     assert bench.do(Restart()).notes == notes
 
 
+def test_a_restart_of_a_live_source_begins_a_map_without_the_notes_of_the_one_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(fakes.FakeFeed, "repeatable", False)
+    bench = Bench()
+    assert bench.do(AddNote("here")).notes
+    again = bench.do(Restart())
+    assert again.notes == () and again.transport.frame == 0
+
+
 def test_a_note_before_the_first_frame_belongs_to_it() -> None:
     (note,) = Bench().do(Pause(), Restart(), AddNote("at the start")).notes
     assert note.frame == 0
