@@ -106,7 +106,10 @@ def verdicts(findings: tuple[Finding, ...]) -> tuple[str, str] | None:
 def log_html(notices: tuple[Notice, ...], recording: str = "") -> str:
     """The newest notices, newest first; those that came while another recording was open name it."""
     lines = [
-        (one.text if one.recording in ("", recording) else f"{one.recording}: {one.text}", _LEVELS[one.level][1])
+        (
+            one.text if one.recording in ("", recording) else f"{one.recording}: {one.text.removeprefix('Live: ')}",
+            _LEVELS[one.level][1],
+        )
         for one in reversed(notices[-_LOG_LINES:])
     ]
     return panel("log", lines)

@@ -38,6 +38,12 @@ from tests.ui.conftest import page_of
 from tests.ui.fake_engine import FINDINGS, FakeEngine
 
 
+def test_news_of_a_live_source_that_was_left_name_it_once() -> None:
+    news = (Notice(1, "info", "Live: connected to foxglove://robot:8765.", "live"),)
+    assert "Live: connected to" in log_html(news, "live")
+    assert "live: connected to" in log_html(news, "walk.mcap")
+
+
 def test_findings_that_need_the_user_come_first_with_their_option() -> None:
     text = findings_html(FINDINGS, Params())
     assert text.index("needs attention") < text.index("corrected") < text.index("fine")
