@@ -39,13 +39,15 @@ def compare(
       hemislam compare runs/walk-1 survey.laz --fit --out changes.ply
     """
     from app.evaluation import cloud_distance
-    from app.evaluation.map_comparison import read_map, sentences
+    from app.evaluation.map_comparison import in_frame_of, read_map, sentences
+    from app.georeference.reference import read
 
     if out is not None:
         _check(out, map_, other)
-    points, sensors = read_map(map_)
+    (points, sensors), (others, _) = read_map(map_), read_map(other)
+    others = in_frame_of(points, read(map_)[0], others, read(other)[0])
     with progress_bar("Comparing") as show:
-        found = cloud_distance.compare(points, sensors, read_map(other)[0], reach=reach, fit=fit, progress=show)
+        found = cloud_distance.compare(points, sensors, others, reach=reach, fit=fit, progress=show)
     typer.echo(f"median       {100 * found.median:+7.1f} cm")
     typer.echo(f"half within  {100 * found.typical:7.1f} cm")
     typer.echo(f"95 % within  {100 * found.p95:7.1f} cm")

@@ -64,8 +64,7 @@ def find(owner: Link, wanted: MapsToCompare) -> None:
         other, _ = placed([scan for scan, is_known in zip(wanted.scans, known, strict=True) if is_known], true_poses)
     else:
         other = read_points(wanted.other, THIN_M, lambda share: owner.send(_READ * share))
-        if wanted.where is not None and np.abs(np.median(other, axis=0)).max() > _OF_A_GRID_M:
-            other = wanted.where.from_crs(other)
+        other = in_frame_of(points, wanted.where, other, None)
     found = compare(
         points, sensors, other, reach=wanted.reach, fit=wanted.fit,
         progress=lambda share: owner.send(_READ + (1 - _READ) * share),
@@ -99,6 +98,18 @@ def read_map(path: Path) -> tuple[F64, F64]:
         points.append(block.points)
         sensors.append(np.broadcast_to(block.T_map_lidar[:3, 3], block.points.shape))
     return np.concatenate(points), np.concatenate(sensors)
+
+
+def in_frame_of(points: F64, where: GeoReference | None, other: F64, others: GeoReference | None) -> F64:
+    """The other map in the frame of the first. If just one of them is in grid coordinates, the georeference of the map
+    that is not converts: `where` is that of the first map, `others` that of the other.
+    """
+    on_earth, other_on_earth = (np.abs(np.median(one, axis=0)).max() > _OF_A_GRID_M for one in (points, other))
+    if where is not None and other_on_earth and not on_earth:
+        return where.from_crs(other)
+    if others is not None and on_earth and not other_on_earth:
+        return others.to_crs(other)
+    return other
 
 
 def sentences(found: Comparison, name: str) -> list[str]:

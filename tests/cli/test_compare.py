@@ -1,5 +1,6 @@
 """A mapped room compared with its exact shape. Tests app/cli/compare.py, app/ui/corners.py."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from app.export.map_file import MapFile
+from app.georeference.reference import FILE, GeoReference
 from app.mapping.kept import Measure
 from app.server.chunks import thinned
 from app.slam.ply import header
@@ -51,6 +53,21 @@ def test_the_map_of_a_room_lies_on_its_exact_walls(results: Path, hemislam: Call
     median, half, most = (float(line.split()[-2]) for line in outcome.out.splitlines()[:3])
     assert abs(median) < 0.3 and half < 0.5 and most < 2.0, "cm"
     assert b"property float distance" in out.read_bytes()[:400]
+
+
+def test_georeferenced_results_are_compared_with_a_map_in_their_grid(
+    results: Path, hemislam: Call, tmp_path: Path
+) -> None:
+    where = GeoReference("EPSG:32632", (500_000.0, 5_400_000.0, 300.0), ((0.0, -1, 0), (1, 0, 0), (0, 0, 1)), 0.9996)
+    folder = shutil.copytree(results, tmp_path / "georeferenced")
+    (folder / FILE).write_text(where.to_json())
+    grid = write(tmp_path / "grid.ply", where.to_crs(exact()))
+    for maps in ((folder, grid), (grid, folder)):
+        outcome = hemislam("compare", *maps)
+        assert outcome.code == 0, outcome.err
+        median, half, _ = (float(line.split()[-2]) for line in outcome.out.splitlines()[:3])
+        assert abs(median) < 1.0 and half < 1.0, "cm"
+    assert "do not lie on each other" in hemislam("compare", results, grid).refused()
 
 
 def test_what_is_no_map_is_refused(results: Path, hemislam: Call, tmp_path: Path) -> None:
