@@ -60,6 +60,7 @@ def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
     outcomes = {o.name: o for recording in recordings for o in recording.outcomes if o.run is not None}
     names = [name for name in outcomes if name not in {variant.name for variant in PAPER}]
     base = "Ours" if "Ours" in outcomes else next(iter(outcomes), "")
+    meanings = {name: outcome.meaning or "as given" for name, outcome in outcomes.items()}
     found, alike = [], []
     for name in names:
         if name == base:
@@ -71,7 +72,8 @@ def _own(recordings: Sequence[Evaluated]) -> list[Claim]:
             continue
         words = "; ".join(f"the mean {metric.name} {difference.words}" for metric, difference in sure)
         size = max(difference.size for _, difference in sure)
-        found.append(Claim(f"{name} against {base} ({outcomes[name].meaning or 'as given'}): {words}.", size, own=True))
+        what = meanings[name] if base == "Ours" else f"{meanings[name]} instead of {meanings[base]}"
+        found.append(Claim(f"{name} against {base} ({what}): {words}.", size, own=True))
     if alike:
         found.append(Claim(f"{', '.join(alike)}: no difference from {base} beyond chance.", 0.0, own=True))
     return found
