@@ -309,21 +309,17 @@ class Controller:
             self._player.play()
 
     def _reopen(self, stay: bool) -> None:
-        """Restart with the present parameters. User data stays; loop edits stay only if the keyframes are the same.
-
-        A live source begins another map, in which what was added to the map before has no place.
-        """
+        """Restart with the present parameters. User data stays; loop edits stay only if the keyframes are the same."""
         before, kept = self._need_session(), self._kept
         aim = self._player.aim(before) if stay else 0
         self._of_before = 0
         info, edits = before.feed.info, before.edits
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         session.calibration = before.calibration
-        if not session.feed.repeatable:
-            self._take(session)
+        self._take(session)
+        if not session.feed.repeatable:  # it begins another map, in which nothing of the user's has its place
             return
         session.survey = before.survey
-        self._take(session)
         self._keep(kept)
         if session.loops is not None and edits != Edits():
             session.edit_loops(edits.done, edits.undone)
