@@ -36,7 +36,9 @@ def tune(
     search: Annotated[
         Literal["bayes", "random", "grid"], typer.Option("--search", help="How the next settings are chosen.")
     ] = "bayes",
-    trials: Annotated[int, typer.Option("--trials", min=1, metavar="N", help="Settings to try, at most.")] = 100,
+    trials: Annotated[
+        int, typer.Option("--trials", min=1, metavar="N", help="Settings to try besides the given one, at most.")
+    ] = 100,
     held_back: Annotated[
         float | None,
         typer.Option(
