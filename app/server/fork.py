@@ -201,7 +201,11 @@ class Workspace:
         return [file for file in others if fits_beside(a.recording, opened_in(file))]
 
     def swap(self) -> None:
-        """Swap the two: B becomes A, at A's frame, and A becomes B and follows. Raises HemislamError without a fork."""
+        """Swap the two: B becomes A, at A's frame or on the way to where A was going, and A becomes B and follows.
+
+        Raises:
+            HemislamError: there is no fork, or it has no frame yet.
+        """
         with self._lock:
             a, b = self._need_fork()
             before, after = a.engine.snapshot, b.engine.snapshot
@@ -210,8 +214,10 @@ class Workspace:
             a.engine.send(Pause())
             b.engine.send(SetSpeed(before.transport.speed))
             b.engine.send(SetBreakpoints(before.breakpoints))
-            if same_recording(before, after) and before.transport.frame != after.transport.frame:
-                b.engine.send(Seek(before.transport.frame))
+            seek = before.progress.frame if before.progress is not None else None
+            frame = before.transport.frame if seek is None else seek
+            if same_recording(before, after) and frame != after.transport.frame:
+                b.engine.send(Seek(frame))
             if before.transport.playing:
                 b.engine.send(Play())
             self._sides = (replace(b, folder=None), a)  # what A writes, also for other recordings, is kept

@@ -316,7 +316,7 @@ class Player:
             self._page.put(progress=None, urgent=True)
         elif target.frame - target.origin > LONG_SEEK:
             fraction = (frame - target.origin) / (target.frame - target.origin)
-            self._page.put(progress=Progress(f"Going to frame {target.frame}", fraction))
+            self._page.put(progress=Progress(f"Going to frame {target.frame}", fraction, target.frame))
 
     def relabel(self) -> None:
         """Segment the ground of the frame shown again, if needed."""

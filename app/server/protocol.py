@@ -233,10 +233,11 @@ class Transport:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Long work in progress. fraction: 0-1, nan while unknown."""
+    """Long work in progress. fraction: 0-1, nan while unknown. frame: to which it goes, if it is a seek."""
 
     title: str
     fraction: float
+    frame: int | None = None
 
     @classmethod
     def opening(cls, recording: Path | None) -> "Progress":

@@ -29,7 +29,6 @@ from app.server.protocol import (
     Pause,
     Play,
     Seek,
-    SetBreakpoints,
     SetParams,
     SetSpeed,
     Snapshot,
@@ -164,20 +163,6 @@ def test_a_session_is_opened_beside_one_whose_file_cannot_be_written(tmp_path: P
     workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: Recorder(at(5)))
     workspace.open(tmp_path / "older.hemislam")
     assert workspace.names == ("main", "older") and workspace.forked_at == -1
-    workspace.close()
-
-
-def test_only_sessions_from_the_same_start_are_offered_as_b(tmp_path: Path) -> None:
-    for name, start_s in (("whole", 0.0), ("later", 10.0)):
-        writer = SessionWriter(tmp_path / f"{name}.hemislam", Opened(tmp_path / "walk.mcap", start_s))
-        writer.write(5, State(Params()))
-        writer.close()
-    (tmp_path / "empty.hemislam").touch()
-    a = Recorder(at(5, name=str(tmp_path / "walk")))
-    workspace = Workspace(a, Setup(session_folder=tmp_path), lambda setup: Recorder(at(5)))
-    assert workspace.kept() == [tmp_path / "whole.hemislam"]
-    a.snapshot = Snapshot()
-    assert workspace.kept() == []
     workspace.close()
 
 
@@ -388,23 +373,3 @@ def test_a_kept_fork_opens_where_it_was(real: Workspace) -> None:
         assert opened.params == b.params
     finally:
         engine.close()
-
-
-def test_breakpoints_stay_with_what_is_shown() -> None:
-    class Told:
-        def __init__(self, snapshot: Snapshot) -> None:
-            self.snapshot, self.sent = snapshot, []
-
-        def send(self, command: object) -> None:
-            self.sent.append(command)
-
-    from app.mapping.breakpoints import Breakpoints
-    from app.server.fork import Side
-
-    a, b = Told(replace(at(7), breakpoints=Breakpoints(no_ground=True))), Told(at(5))
-    workspace = Workspace(a, Setup(), lambda _: b)  # type: ignore[arg-type, return-value]
-    workspace._sides = (Side(a, "main"), Side(b, "b"))  # type: ignore[arg-type]
-    workspace.swap()
-    *led, noted = b.sent
-    assert led == [SetSpeed(1.0), SetBreakpoints(Breakpoints(no_ground=True)), Seek(7)] and a.sent == [Pause()]
-    assert noted == AddNote("Swapped: replaces main.")
