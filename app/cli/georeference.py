@@ -17,7 +17,11 @@ def georeference(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="A folder that `run` or the workbench wrote.")],
     gnss: Annotated[
         Path | None,
-        typer.Option("--gnss", metavar="FILE", help="NMEA log or CSV of fixes; default: the fixes in the recording."),
+        typer.Option(
+            "--gnss",
+            metavar="FILE",
+            help="NMEA log or CSV of fixes, or a recording that holds them; default: that of RESULTS.",
+        ),
     ] = None,
     control: Annotated[
         Path | None,
@@ -77,12 +81,10 @@ def georeference(
       hemislam georeference runs/walk-1 --factors --out runs/walk-1-bent
       hemislam georeference runs/walk-1 --control points.csv --picks picked.csv --crs EPSG:25832
     """
-    from app.export.folder import recording_of
     from app.georeference import ledger
     from app.georeference.align import align
     from app.georeference.control import CONTROL, PICKS, align_with_points, read_picks
     from app.georeference.tables import read_table
-    from app.mapping.earth import fixes_of
     from app.slam.trajectory import read_tum
 
     if (control is None) != (picks is None) or (control is not None and (gnss is not None or lever_arm is not None)):
@@ -101,12 +103,7 @@ def georeference(
         found = align_with_points(read_table(control, *CONTROL), picked, grid=crs, height=height or "ellipsoidal")
         lines = [*ledger.summary(found, "control points"), "", *ledger.table(found)]
     else:
-        recording = results if gnss is not None else recording_of(results)
-        if recording is None:
-            raise HemislamError(
-                f"{results} has no report.json that names its recording; give the fixes with --gnss FILE."
-            )
-        fixes, heights = fixes_of(recording, gnss, int(trajectory.stamps_ns[0]))
+        fixes, heights = _fixes(results, gnss, int(trajectory.stamps_ns[0]))
         overridden = {str(fix): fix in (accept or []) for fix in (*(accept or []), *(reject or []))}
         found = align(trajectory, fixes, grid=crs, height=height or heights, lever=lever_arm, overridden=overridden)
         if unknown := sorted(set(overridden) - set(found.names)):
@@ -121,6 +118,22 @@ def georeference(
             lines += ["", *ledger.table(found, only_rejected=True)]
     typer.echo("\n".join(lines))
     _write(results, found, trajectory)
+
+
+def _fixes(results: Path, gnss: Path | None, near_ns: int) -> "tuple[Fixes, str]":
+    """Fixes and reference of their heights: of a file, of a recording, or of the recording of the results."""
+    from app.export.folder import recording_of
+    from app.mapping.earth import fixes_of
+    from app.sensors.source import SUFFIXES
+
+    if gnss is not None and not (gnss.is_dir() or gnss.suffix.lower() in SUFFIXES):
+        return fixes_of(gnss, gnss, near_ns)
+    recording = gnss or recording_of(results)
+    if recording is None:
+        raise HemislamError(f"{results} has no report.json that names its recording; give the fixes with --gnss FILE.")
+    if not recording.exists():
+        raise HemislamError(f"There is no recording {recording}; give its path now, or the fixes, with --gnss FILE.")
+    return fixes_of(recording, None, near_ns)
 
 
 def _bent(

@@ -12,12 +12,14 @@ import pytest
 from app.export import map_file
 from app.export.points import Block
 from app.georeference import reference
+from app.sensors.navsat import navsat_message
 from app.slam import lie
 from app.slam.keyframe_id import KeyframeId
 from app.slam.loops.factors import Factor
 from app.slam.loops.solvers import g2o_text
 from app.slam.trajectory import read_tum, stamp_text, write_tum
 from tests.georeference.walks import LEVER, TRUTH, Walked, off, walked
+from tests.sensors.rig import write_mcap
 
 Call = Callable[..., Any]
 
@@ -58,7 +60,20 @@ def test_without_fixes_it_says_where_to_take_them_from(hemislam: Call, results: 
     assert outcome.code == 2 and "--gnss FILE" in outcome.err
     (results / "report.json").write_text(json.dumps({"recording": {"path": str(results / "gone.mcap")}}))
     outcome = hemislam("georeference", results)
-    assert outcome.code == 2 and "There is no recording" in outcome.err
+    assert outcome.code == 2 and "There is no recording" in outcome.err and "--gnss FILE" in outcome.err
+
+
+def test_the_fixes_of_a_recording_that_was_moved_are_read_where_it_is_now(
+    hemislam: Call, made: Walked, results: Path
+) -> None:
+    times = made.fixes.stamps_ns.tolist()
+    moved = write_mcap(
+        results / "moved.mcap", [("/fix", time, navsat_message(made.fixes, index)) for index, time in enumerate(times)]
+    )
+    outcome = hemislam("georeference", results, "--gnss", moved, "--lever-arm", *LEVER)
+    assert outcome.code == 0, outcome.err
+    found, _ = reference.read(results)
+    assert found is not None and np.sqrt((off(found, made.trajectory) ** 2).mean()) < 0.02
 
 
 def test_a_folder_without_a_trajectory_is_refused(hemislam: Call, tmp_path: Path) -> None:
