@@ -89,7 +89,7 @@ def match(truth: TruePoses, estimate: Trajectory, offset_s: float | None = None)
     if has_rotation:
         there, has_rotation, note = _common_axes(there, estimate, certainly=truth.own_axes)
         notes += [note] if note else []
-    return Matched(there, has_rotation, added_s, tuple(notes))
+    return Matched(there if has_rotation else _turned_alike(there, estimate), has_rotation, added_s, tuple(notes))
 
 
 def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
@@ -104,6 +104,16 @@ def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
     turning = Slerp((estimate.stamps_ns - start) * 1e-9, estimate.rotations)
     rotations = Rotation.from_matrix(T[:3, :3]) * turning((there.stamps_ns - start) * 1e-9)
     return replace(there, quaternions=rotations.as_quat())
+
+
+def _turned_alike(there: Trajectory, estimate: Trajectory) -> Trajectory:
+    """The truth at the stamps of the estimate with its orientations: between fixes, a hand turns back and forth."""
+    theirs, usable = interpolate(there, estimate.stamps_ns)
+    if len(theirs) < 3:
+        return there  # the metrics report it
+    ours = estimate.chosen(usable)
+    T = umeyama(ours.positions, theirs.positions)
+    return replace(theirs, quaternions=(Rotation.from_matrix(T[:3, :3]) * ours.rotations).as_quat())
 
 
 def _common_axes(there: Trajectory, estimate: Trajectory, *, certainly: bool) -> tuple[Trajectory, bool, str]:

@@ -203,6 +203,18 @@ def test_satellite_fixes_are_metres_east_north_up(tmp_path: Path) -> None:
     assert ate(ESTIMATE, matched.trajectory).position.max < 0.06  # chords of half a second
 
 
+def test_a_device_that_sways_between_fixes_has_no_error_of_motion_by_that() -> None:
+    """Its orientations are known only from the estimate, ten times a second, and the fixes come twice a second."""
+    seconds = walks.frames()
+    walk = walks.wandering(seconds)
+    sway = Rotation.from_rotvec(0.15 * np.sin(9.0 * seconds)[:, None] * [1.0, 0.0, 0.0])
+    estimate = seen_elsewhere(Trajectory(walk.stamps_ns, walk.positions, (walk.rotations * sway).as_quat()))
+    fixes = walk.chosen(np.arange(0, len(walk), 5))
+    matched = match(TruePoses("fixes", "fixes", fixes.stamps_ns, fixes.positions, None), estimate)
+    found = rpe(estimate, matched.trajectory, metres=20.0)
+    assert found is not None and found.position.max < 0.1
+
+
 def test_a_truth_in_the_imus_axes_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "truth.tum"
     write_tum(path, walks.wandering(walks.frames()))
