@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from app.evaluation.job import Job
 from app.evaluation.measured import Evaluated, Outcome, load, measure
 from app.evaluation.report import write_report
@@ -17,6 +19,9 @@ from app.slam.params import Params
 from app.slam.provenance import sha256_of
 from app.slam.text_files import make_folder
 from app.slam.trajectory import Trajectory
+
+HALF_A_SCAN_NS = 50_000_000
+"""Another system may stamp its poses a little differently."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +103,22 @@ def evaluate(
             else load(jobs[subject.name, variant.name], variant.meaning)
             for variant in variants
         ]
-        outcomes += [Outcome(name, "a trajectory from elsewhere", trajectory=other) for name, other in subject.compared]
+        part = outcomes if start_s or duration_s is not None else []
+        outcomes += [_elsewhere(name, other, part) for name, other in subject.compared]
         outcomes, notes, truth_path = measure(outcomes, subject.truth)
         truth = subject.truth.description if subject.truth else ""
         sha256 = hashes[subject.name]
         evaluated.append(Evaluated(subject.name, subject.recording, sha256, tuple(outcomes), truth, notes, truth_path))
     return write_report(folder, evaluated), failures
+
+
+def _elsewhere(name: str, other: Trajectory, part: list[Outcome]) -> Outcome:
+    """Another system's trajectory, within the time of these outcomes: only that part is measured."""
+    meaning = "a trajectory from elsewhere"
+    if measured := [outcome.trajectory.stamps_ns for outcome in part if outcome.trajectory is not None]:
+        stamps = np.concatenate(measured)
+        begin, end = stamps.min() - HALF_A_SCAN_NS, stamps.max() + HALF_A_SCAN_NS
+        other = other.chosen((begin <= other.stamps_ns) & (other.stamps_ns <= end))
+    if len(other) < 3:
+        return Outcome(name, meaning, missing="it has fewer than 3 poses in this part of the recording")
+    return Outcome(name, meaning, trajectory=other)

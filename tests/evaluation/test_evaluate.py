@@ -115,6 +115,18 @@ def test_it_is_said_which_point_the_truth_is_taken_of(evaluated: Path) -> None:
     )
 
 
+def test_of_a_part_only_that_part_of_another_trajectory_is_measured(
+    recording: Path, evaluated: Path, tmp_path: Path
+) -> None:
+    theirs = ["--compare", f"Perfect={evaluated / 'theirs.tum'}"]
+    done = call(recording, "--out", tmp_path, "--no-ablation", "--variant", VARIANT, "--duration", "3.3", *theirs)
+    assert done.exit_code == 0, done.output
+    ours, perfect = (columns(tmp_path)[name]["accuracy"] for name in ("coarse", "Perfect"))
+    whole = columns(evaluated)["Perfect"]["accuracy"]
+    assert perfect["distance_m"] == pytest.approx(ours["distance_m"], rel=0.05)
+    assert perfect["distance_m"] < 0.9 * whole["distance_m"]
+
+
 def test_a_finished_run_is_not_run_again(recording: Path, evaluated: Path) -> None:
     runs = sorted((evaluated / "runs").rglob("run.json"))
     before = {path: path.stat().st_mtime_ns for path in runs}
