@@ -109,7 +109,7 @@ class Bench:
         viser gathers for 50 ms what a page says, and a page draws every 100 ms.
         """
         self.engine.send(StepFrame())
-        expect(self.page.get_by_text(f"frame {self.engine.snapshot.transport.frame} of")).to_be_visible()
+        self.page.locator(".hs-when", has_text=f"frame {self.engine.snapshot.transport.frame} of").wait_for()
         self.page.wait_for_timeout(300)
 
     def look(self, position: Any, look_at: Any) -> None:
