@@ -4,11 +4,11 @@ Tests app/ui/appearance.py, in both themes.
 """
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from app.server.chunks import MOST_SHOWN
 from app.server.protocol import StepFrame
-from tests.browser.conftest import ALPHA, SLIDERS, Bench, new_page
+from tests.browser.conftest import ALPHA, SLIDERS, Bench
 
 TABS = ("Parameters", "Readouts", "Loops", "Study", "A/B", "Auto-tune", "View", "Recording", "Help")
 
@@ -149,9 +149,9 @@ def test_a_frame_draws_each_keyframe_once_and_no_more_points_than_the_page_holds
     assert keyframes <= MOST_SHOWN
 
 
-def test_a_tooltip_in_a_narrow_window_stands_above_the_sheet(bench: Bench, chromium: Browser) -> None:
-    page = new_page(chromium, 560, 800)
-    page.goto(bench.url)
+def test_a_tooltip_in_a_narrow_window_stands_above_the_sheet(bench: Bench) -> None:
+    page = bench.page
+    page.set_viewport_size({"width": 560, "height": 800})
     tab, tip = page.get_by_role("tab", name="Parameters").first, page.locator(".mantine-Tooltip-tooltip")
     sheet = page.locator("[style*='max-height: 60%']").element_handle()
 
@@ -169,4 +169,4 @@ def test_a_tooltip_in_a_narrow_window_stands_above_the_sheet(bench: Bench, chrom
     bench.eventually(stands_above)
     page.get_by_role("button", name="Diagnostics").click()
     expect(tip).to_have_count(0)
-    page.close()
+    page.set_viewport_size({"width": 1000, "height": 620})
