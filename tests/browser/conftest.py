@@ -160,14 +160,13 @@ def chromium() -> Iterator[Browser]:
         browser.close()
 
 
-def new_page(chromium: Browser, width: int, height: int, *, tour: bool = False) -> Page:
-    """A page on which an error or a warning of our own fails the test. tour: as on a first visit."""
+def new_page(chromium: Browser, width: int, height: int, tour: str | None = None) -> Page:
+    """A page on which an error or a warning of our own fails the test. tour: as on a first visit, running this."""
     page = chromium.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(SLOW_MS)
     page.add_init_script(AT_TEN_FRAMES_A_SECOND)
     page.add_init_script(COARSE)
-    if not tour:
-        page.add_init_script("localStorage.setItem('hemislam-tour', 'seen')")
+    page.add_init_script("localStorage.setItem('hemislam-tour', 'seen')" if tour is None else tour)
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
     return page
@@ -189,20 +188,22 @@ def opened(
     width: int,
     height: int,
     camera: tuple[Any, Any] | None = None,
+    tour: str | None = None,
 ) -> Iterator[Bench]:
     """A workbench on an engine, which stays the caller's, and its page, ready to be clicked.
 
     Args:
         camera: where it is at first, and what it looks at.
+        tour: a script; as on a first visit.
     """
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     forks = engine if isinstance(engine, Workspace) else alone(engine)
     workbench = Workbench(server, forks, Folders([folder]))
     workbench.start()
-    page = new_page(chromium, width, height)
+    page = new_page(chromium, width, height, tour)
     with serving(forks, Viser(server, ""), folder, None, parts=workbench.parts) as site:
         page.goto(site.url())
-        expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+        page.locator(".hs-play").wait_for()
         bench = Bench(server, workbench, engine, page, site.url())
         if camera is not None:
             bench.look(*camera)

@@ -1,6 +1,8 @@
 """Keys of the page in a real Chromium: held keys, keys pressed while a dialog is open, and typing into fields.
 
-Numbers typed into boxes are at the end. Tests app/ui/viser_adapter.py, app/ui/parameters.py, app/ui/widgets.py.
+Then the messages of the page's own script to the server, and numbers typed into boxes.
+
+Tests app/ui/viser_adapter.py, app/ui/parameters.py, app/ui/widgets.py.
 """
 
 import re
@@ -9,8 +11,8 @@ import pytest
 from playwright.sync_api import Locator, expect
 
 from app.server.keeping import AddNote, SetClip
-from app.server.protocol import Pause, Play, Save, SetParams, StepFrame
-from tests.browser.conftest import Bench
+from app.server.protocol import Pause, Play, Save, SetParams, SetSpeed, StepFrame
+from tests.browser.conftest import ALPHA, SLIDERS, Bench
 
 
 @pytest.fixture(autouse=True)
@@ -137,6 +139,45 @@ def test_enter_in_a_dialog_does_what_its_button_says_with_all_that_was_typed(ben
     (save,) = (command for command in bench.engine.sent if isinstance(command, Save))
     assert save.folder.name == "north wing"
     page.get_by_role("tab", name="Parameters").click()
+
+
+def test_what_is_asked_for_in_the_same_moment_all_arrives(bench: Bench) -> None:
+    bench.engine.sent.clear()
+    bench.page.evaluate(
+        """[['camera', 'cover 66'], ['transport', 'speed 2×'], ['transport', 'step 1'], ['camera', 'cover 70']].forEach(
+          ([name, word]) => hemislamTell(name, word))"""
+    )
+    bench.eventually(lambda: StepFrame(1) in bench.engine.sent)
+    assert SetSpeed(2.0) in bench.engine.sent
+
+
+def test_a_word_of_the_page_does_not_take_the_place_of_what_a_slider_was_set_to(bench: Bench) -> None:
+    """viser sends only the last of what changes within 50 ms, of all controls of a tab together."""
+    said, alpha = bench.workbench._parameters._bridge._field, bench.engine.snapshot.params.ground.alpha
+    before = said.value
+    bench.page.get_by_role("tab", name="Parameters").click()
+    slider = bench.page.locator(SLIDERS).nth(ALPHA)
+    slider.evaluate(
+        """async (thumb) => {
+          const busy = (ms) => { for (const end = performance.now() + ms; performance.now() < end;); };
+          for (let n = 0; n < 3; n++) {
+            thumb.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight', bubbles: true}));
+            await null; // the slider is drawn, but no timer fires
+          }
+          busy(100); // viser's timer and ours are both late
+          hemislamTell('sliders', 'released');
+          busy(200);
+        }"""
+    )
+    bench.eventually(lambda: said.value != before)
+
+    def agree() -> bool:
+        """The slider may be set back for a moment, by what the engine says of the first step."""
+        shown = float(slider.get_attribute("aria-valuenow") or "nan")
+        return bench.engine.snapshot.params.ground.alpha == shown
+
+    bench.eventually(agree, seconds=20.0)
+    assert bench.engine.snapshot.params.ground.alpha > alpha
 
 
 def boxes(bench: Bench, label: str) -> Locator:
