@@ -1,5 +1,6 @@
 """Log times made wrong by a flipped bit or a recorder's clock do not affect other messages."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,19 @@ from app.slam.types import Measurement
 from tests.sensors import rig
 
 S = 1_000_000_000
-TURNS = 160
+TURNS = 100
 LAYOUT = rig.Layout(absolute=False, fields=rig.RELATIVE, header="first")
 Wrong = list[tuple[str, float, int]]
 """Topic, place among its messages, 0-1, and by how many seconds its log time is wrong."""
 
 
+@cache
+def right(ros: int) -> tuple[rig.Entry, ...]:
+    return tuple(rig.walk(TURNS, LAYOUT, columns=4, ros=ros))
+
+
 def walk(wrong: Wrong, ros: int = 2) -> list[rig.Entry]:
-    entries = rig.walk(TURNS, LAYOUT, columns=4, ros=ros)
+    entries = list(right(ros))
     for topic, place, by_s in wrong:
         numbers = [number for number, entry in enumerate(entries) if entry[0] == topic]
         number = numbers[min(round(place * len(numbers)), len(numbers) - 1)]
@@ -36,9 +42,9 @@ def written(path: Path, container: str, wrong: Wrong) -> Path:
 
 
 def read(path: Path) -> tuple[float, int, int, list[Finding]]:
-    """Length in s, scans of all, scans from 10 to 14 s, and what is not fine about log times and clocks."""
+    """Length in s, scans of all, scans from 5 to 9 s, and what is not fine about log times and clocks."""
     with open_recording(path, Params()) as recording:
-        parts = [list(recording.measurements()), list(recording.measurements(10.0, 4.0))]
+        parts = [list(recording.measurements()), list(recording.measurements(5.0, 4.0))]
         of_times = [f for f in recording.findings if f.subject in ("log times", "clocks", "clock leap")]
         return (
             recording.duration_s,
