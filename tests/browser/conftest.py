@@ -81,11 +81,11 @@ class Bench:
     page: Page
     url: str
 
-    def eventually(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
+    def eventually(self, holds: Callable[[], bool], seconds: float = 60.0, every_ms: float = 50.0) -> None:
         deadline = time.monotonic() + seconds
         while not holds():
             assert time.monotonic() < deadline, "it did not come about in time"
-            self.page.wait_for_timeout(50)
+            self.page.wait_for_timeout(every_ms)
 
     def within(self, seconds: float, holds: Callable[[], bool]) -> bool:
         """Whether it comes about in this time, as soon as it does."""

@@ -54,7 +54,7 @@ def test_a_fork_is_tuned_seen_swapped_and_kept(bench: Bench, forks: Workspace, t
     if "HEMISLAM_SHOTS" in os.environ:
         page.wait_for_timeout(2500)
         page.screenshot(path=Path(os.environ["HEMISLAM_SHOTS"]) / "fork.png")
-    bench.eventually(lambda: blue(bench) > before + 50)
+    bench.eventually(lambda: blue(bench) > before + 50, every_ms=500)  # taking a picture is work
     bench.press("x", lambda: forks.names == ("wide band", "main"))
     expect(page.get_by_text("A · wide band")).to_be_visible()
     page.get_by_role("button", name="keep", exact=True).click()
