@@ -107,7 +107,8 @@ def _borrow_rotation(there: Trajectory, estimate: Trajectory) -> Trajectory:
 
 
 def _turned_alike(there: Trajectory, estimate: Trajectory) -> Trajectory:
-    """The truth at the stamps of the estimate with its orientations: between fixes, a hand turns back and forth."""
+    """The truth at the estimate's stamps, with the estimate's orientations. Those at the fixes cannot be interpolated,
+    since a hand turns back and forth between two of them."""
     theirs, usable = interpolate(there, estimate.stamps_ns)
     if len(theirs) < 3:
         return there  # the metrics report it

@@ -16,7 +16,7 @@ WGS84 = "EPSG:4979"
 EARTH_M = 6_371_000.0
 """Mean radius."""
 STEP_M = 50.0
-"""How far the places are from which the stretch of a grid is computed."""
+"""Distance of the places from which the stretch of a grid is computed."""
 SAME_STRETCH = 1e-5
 """Lengths in two directions may differ by this share: 1 mm in 100 m."""
 
@@ -152,14 +152,14 @@ def grid_scale(name: str, latitude: float, longitude: float, height: float) -> f
     return math.sqrt(most * least) * EARTH_M / (EARTH_M + height)
 
 
-def unlike(name: str, east: float, north: float) -> str:
-    """That a grid stretches a map in one direction more than in another, in a sentence; "" if it hardly does."""
+def distortion(name: str, east: float, north: float) -> str:
+    """That a grid stretches one direction more than another, and which grid does not; "" if it hardly does."""
     here = place(name, east, north)
     most, least = stretches(name, *here)
-    share = most / least - 1.0
-    if share < SAME_STRETCH:
+    more = most / least - 1.0
+    if more < SAME_STRETCH:
         return ""
     return (
-        f"{name} stretches lengths by {100 * share:.2f} % more in one direction than in another, which the map cannot"
-        f" follow, since it keeps its shape; {utm(*here)} does not stretch it so."
+        f"{name} stretches lengths by {100 * more:.2f} % more in one direction than in another. The map keeps its"
+        f" shape, so it cannot fit this grid everywhere; {utm(*here)} stretches all directions alike."
     )

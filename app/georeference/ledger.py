@@ -65,7 +65,7 @@ def in_rows(alignment: "Alignment", what: str) -> list[tuple[str, str]]:
         rows.append(("Lever arm", f"{x:.3f} {y:.3f} {z:.3f} m{_plus(alignment.lever_sigma, ' m', 3)}"))
     rms = " ".join(f"{axis} {value:.4f} m" for axis, value in zip("ENH", alignment.rms, strict=True))
     rows.append(("Residuals (RMS)", f"{rms}, of {used} of {len(alignment.used)} {what}"))
-    notes = [*alignment.notes, *filter(None, [crs.unlike(where.crs, east, north)])]
+    notes = [*alignment.notes, *filter(None, [crs.distortion(where.crs, east, north)])]
     if (sigma_s := alignment.offset_sigma_s) > SURE_OFFSET_S:
         notes.append(
             f"The clock offset is uncertain by {sigma_s * 1e3:.1f} ms; to determine it better, walk longer and change"

@@ -317,7 +317,7 @@ class Controller:
         session = self._open_session(info.path, before.truth_path, self._params, (info.start_s, info.part_s))
         session.calibration = before.calibration
         self._take(session)
-        if not session.feed.repeatable:  # it begins another map, in which nothing of the user's has its place
+        if not session.feed.repeatable:  # a live source begins another map, where notes have no place
             return
         session.survey = before.survey
         self._keep(kept)

@@ -91,9 +91,9 @@ def test_web_mercator_stretches_by_the_radii_of_the_ellipsoid() -> None:
 
 
 def test_a_grid_that_changes_the_shape_of_a_map_is_told() -> None:
-    told = crs.unlike("EPSG:3857", 1_288_513.8, 6_129_650.0)
+    told = crs.distortion("EPSG:3857", 1_288_513.8, 6_129_650.0)
     assert "EPSG:3857 stretches lengths by 0.30 % more in one direction" in told and "EPSG:32632" in told
-    assert crs.unlike("EPSG:32632", 691_561.7, 5_334_716.1) == ""
+    assert crs.distortion("EPSG:32632", 691_561.7, 5_334_716.1) == ""
 
 
 def test_heights_stand_in_the_text_of_a_coordinate_system() -> None:
