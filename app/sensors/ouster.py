@@ -264,12 +264,13 @@ class OusterStream(PacketStream):
         parts = [self._points(columns, times, one) for one in meta.profile.returns]
         return ros.points_message(np.concatenate(parts), int(times.min()), "os_lidar")
 
-    def _points(self, columns: Any, times: I64, of: _Return) -> Any:
+    def _points(self, columns: Any, times: I64, echo: _Return) -> Any:
         """(n,) points of one return."""
         meta = self._metadata
-        parts = ros.structure(meta.profile.pixel, range=(of.layout, of.at), reflectivity=("u1", of.reflectivity_at))
+        range_, reflectivity = (echo.layout, echo.at), ("u1", echo.reflectivity_at)
+        parts = ros.structure(meta.profile.pixel, range=range_, reflectivity=reflectivity)
         pixels = columns["pixels"].view(parts)
-        ranges = (pixels["range"] & of.bits).astype(np.float64) * of.unit_mm
+        ranges = (pixels["range"] & echo.bits).astype(np.float64) * echo.unit_mm
         column, row = np.nonzero(ranges)
         directions, origins = meta.rays
         where = columns["place"][column]

@@ -28,7 +28,7 @@ PACKETS = {
 def _set_aside(why: str) -> Finding:
     text = (
         f"{why}, so the IMU is not used: motion is estimated from the LiDAR alone, less accurately, and not in quick "
-        "turns; have the driver send raw accelerations, or start hemislam with --imu-topic and another topic"
+        "turns; have the driver send raw measurements, or start hemislam with --imu-topic and another topic"
     )
     return Finding("IMU topic", "needs you", text)
 

@@ -214,8 +214,8 @@ class Workspace:
             a.engine.send(Pause())
             b.engine.send(SetSpeed(before.transport.speed))
             b.engine.send(SetBreakpoints(before.breakpoints))
-            seek = before.progress.frame if before.progress is not None else None
-            frame = before.transport.frame if seek is None else seek
+            aim = before.progress.frame if before.progress is not None else None
+            frame = before.transport.frame if aim is None else aim
             if same_recording(before, after) and frame != after.transport.frame:
                 b.engine.send(Seek(frame))
             if before.transport.playing:

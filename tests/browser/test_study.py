@@ -8,25 +8,15 @@ import pytest
 from playwright.sync_api import Locator, expect
 
 from app.mapping.breakpoints import Breakpoints
-from app.sensors.live.status import Counters, LiveState
+from app.sensors.live.status import Counters
 from app.server.protocol import Seek, SetBreakpoints, StepFrame
 from tests.browser.conftest import Bench
+from tests.ui.conftest import WELL
 
 LEFT, RIGHT = 78, 72
 """Pixels of the timeline beside its strips: names and values."""
 PANEL = 640, 1000
 """Where the panel begins and ends across the page, in pixels."""
-WELL = LiveState(
-    counters=Counters(packets=151_000, frames=1000, imu=20_000),
-    lidar_hz=10.0,
-    imu_hz=200.0,
-    lidar_age_s=0.03,
-    imu_age_s=0.004,
-    clock="sensor",
-    imu_lag_s=0.0021,
-    sensor="RS-Bpearl 68656d690001: 600 rpm, strongest return",
-    recorded=12_345_678,
-)
 
 
 @pytest.fixture(autouse=True)

@@ -11,6 +11,7 @@ import pytest
 import viser
 from viser._messages import GuiUpdateMessage
 
+from app.sensors.live.status import Counters, LiveState
 from app.server.protocol import Command, Snapshot, StepFrame
 from app.server.viser_adapter import _list_icons_once
 from app.ui.widgets import Page
@@ -18,6 +19,19 @@ from tests.ui.fake_engine import FakeEngine
 
 if TYPE_CHECKING:
     from tests.ui.drawn import Drawn
+
+WELL = LiveState(
+    counters=Counters(packets=1000, frames=10),
+    lidar_hz=10.0,
+    imu_hz=199.96,
+    lidar_age_s=0.03,
+    imu_age_s=0.004,
+    clock="sensor",
+    imu_lag_s=0.0021,
+    sensor="RS-Bpearl 68656d690001: 600 rpm, strongest return",
+    recorded=12_345_678,
+)
+"""A live source from which everything arrives as it should."""
 
 
 class Wire:

@@ -15,20 +15,8 @@ from app.server.protocol import LIVE, Command, OpenRecording, StepFrame
 from app.ui.html import BAD, GOOD, WARN
 from app.ui.live import LivePanel, live_html, verdict
 from app.ui.transport import TransportPanel, state, where
-from tests.ui.conftest import Clock, Wire, page_of, user_clicks
+from tests.ui.conftest import WELL, Clock, Wire, page_of, user_clicks
 from tests.ui.fake_engine import FakeEngine
-
-WELL = LiveState(
-    counters=Counters(packets=1000, frames=10),
-    lidar_hz=10.0,
-    imu_hz=199.96,
-    lidar_age_s=0.03,
-    imu_age_s=0.004,
-    clock="sensor",
-    imu_lag_s=0.0021,
-    sensor="RS-Bpearl 10 Hz",
-    recorded=12_345_678,
-)
 
 
 def shown(state: LiveState) -> str:
@@ -40,7 +28,7 @@ def test_each_reading_has_its_unit() -> None:
     for words in ("LiDAR 10.0 Hz last 30 ms ago", "IMU 200.0 Hz last 4 ms ago", "packets lost 10 1.00 % of 1,000",
                   "not usable 4 packets", "duplicates 3", "scans dropped 2", "waiting 1 scans",
                   "IMU behind LiDAR +2.1 ms", "recorded 12 MB", "clock in use the sensors' own",
-                  "RS-Bpearl 10 Hz"):  # fmt: skip
+                  "RS-Bpearl 68656d690001: 600 rpm, strongest return"):  # fmt: skip
         assert words in text, words
 
 
